@@ -1,0 +1,1 @@
+"""The two commands; they parse, call one library function, and print."""

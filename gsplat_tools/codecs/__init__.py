@@ -1,0 +1,1 @@
+"""Arrays to small integers and back; every codec states its largest error."""

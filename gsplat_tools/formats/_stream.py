@@ -1,0 +1,86 @@
+"""Reading what a header promises, and no more: exact reads, claims held against the bytes that are there."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import tempfile
+from typing import BinaryIO, cast
+
+from gsplat_tools.errors import LimitExceededError, TruncatedDataError
+
+MAX_EXPANSION = 1024
+"""A header that claims more than this many times its file's size is refused before anything is allocated."""
+
+_SPOOL_BYTES = 16 << 20
+
+
+def read_exactly(stream: BinaryIO, size: int, *, field: str) -> bytes:
+    """Read `size` bytes of `field`.
+
+    Raises
+    ------
+    TruncatedDataError
+        The stream ends first.
+    """
+    start = stream.tell()
+    parts = []
+    missing = size
+    while missing > 0:
+        part = stream.read(missing)  # may be short on pipes and raw streams
+        if not part:
+            raise TruncatedDataError(f"needs {size} bytes but only {size - missing} remain", offset=start, field=field)
+        parts.append(part)
+        missing -= len(part)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def read_into(stream: BinaryIO, buffer: memoryview, *, field: str) -> None:
+    """Fill `buffer` from the stream.
+
+    Raises
+    ------
+    TruncatedDataError
+        The stream ends first.
+    """
+    start = stream.tell()
+    done = 0
+    while done < len(buffer):
+        count = cast("io.BufferedIOBase", stream).readinto(buffer[done:])
+        if not count:
+            raise TruncatedDataError(f"needs {len(buffer)} bytes but only {done} remain", offset=start, field=field)
+        done += count
+
+
+def stream_size(stream: BinaryIO) -> int:
+    """Return the length of a stream that can seek, leaving its position as it was."""
+    position = stream.tell()
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(position)
+    return size
+
+
+def seekable(stream: BinaryIO) -> BinaryIO:
+    """Return the stream, or a temporary copy of what is left of it where it cannot seek (pipes)."""
+    if stream.seekable():
+        return stream
+    copy = tempfile.SpooledTemporaryFile(max_size=_SPOOL_BYTES)  # noqa: SIM115 - the caller owns it
+    shutil.copyfileobj(stream, copy)
+    copy.seek(0)
+    return cast("BinaryIO", copy)
+
+
+def check_claim(claimed: int, available: int, *, field: str, offset: int | None = None) -> None:
+    """Refuse a decoded size that no honest file of `available` bytes would claim.
+
+    Raises
+    ------
+    LimitExceededError
+        `claimed` bytes are more than MAX_EXPANSION times `available`.
+    """
+    if claimed > available * MAX_EXPANSION:
+        raise LimitExceededError(
+            f"the header claims {claimed} bytes of data in a file of {available} bytes, more than {MAX_EXPANSION} times",
+            field=field,
+            offset=offset,
+        )

@@ -1,0 +1,1 @@
+"""Cloud to new cloud; never in place."""

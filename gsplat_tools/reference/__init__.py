@@ -1,0 +1,1 @@
+"""The answers that GPU implementations are compared with: sorting, rasterizing, image metrics."""
