@@ -87,6 +87,10 @@ class Format:
         Whether these facts about the cloud are stored.
     streams
         Whether `write` takes `CloudChunks` and needs no more memory than a chunk.
+    order
+        Order of splats that `save` chooses when none is asked for: "none" keeps the source's.
+    required_coordinates
+        Axis letters that the format is always in, or None where it takes any.
     position_type
         How positions are stored, for the advice on recentering: "f32", "f16" or "fixed".
     matches
@@ -129,6 +133,8 @@ class Format:
     stores_coordinates: bool = False
     stores_splat_model: bool = False
     streams: bool = False
+    order: str = "none"
+    required_coordinates: str | None = None
     position_type: str = "f32"
     read_options: type = NoOptions
     write_options: type = NoOptions

@@ -1,0 +1,170 @@
+"""Paths to scenes: detect the format, read, and drop or refuse what is invalid."""
+
+from __future__ import annotations
+
+import warnings
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from gsplat_tools.chunks import CloudChunks
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning
+from gsplat_tools.formats._stream import seekable
+from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format
+from gsplat_tools.formats.registry import detect
+from gsplat_tools.sequence import GaussianSequence
+
+
+@contextmanager
+def located(path: Path) -> Iterator[None]:
+    """Give the path to errors of stream readers, which cannot know it."""
+    try:
+        yield
+    except GsplatError as error:
+        if error.path is None:
+            error.path = path
+        raise
+
+
+def open_source(path: Path) -> tuple[BinaryIO, Format]:
+    """Open a file and find its format from its first bytes, then from its name; the caller closes it."""
+    stream = seekable(path.open("rb"))
+    try:
+        head = stream.read(SNIFF_BYTES)
+        stream.seek(0)
+        return stream, detect(head, path)
+    except BaseException:
+        stream.close()
+        raise
+
+
+def read_options(record: Format, options: dict[str, Any]) -> Any:
+    """Build the read options of a format.
+
+    Raises
+    ------
+    CapabilityError
+        The format does not know one of the options, or has no reader.
+    """
+    if record.read is None:
+        raise CapabilityError(f"{record.title} can be written but not read")
+    known = {option.name for option in fields(record.read_options)}
+    unknown = sorted(set(options) - known)
+    if unknown:
+        raise CapabilityError(
+            f"{record.title} has no read option {', '.join(unknown)}; it has {', '.join(sorted(known)) or 'none'}"
+        )
+    return record.read_options(**options)
+
+
+def load(path: str | Path, *, strict: bool = False, **options: Any) -> GaussianCloud | GaussianSequence:
+    """Load a scene; the format follows from the content, then from the extension.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    strict
+        Refuse invalid splats instead of dropping and counting them.
+    **options
+        Read options of the format.
+
+    Returns
+    -------
+    GaussianCloud | GaussianSequence
+        A cloud, or lazy frames for formats that hold sequences (also for a single frame). Frames of a sequence are
+        returned as stored.
+
+    Raises
+    ------
+    FormatError
+        The bytes are at fault; the error names path, offset and field.
+    CapabilityError
+        The format has no reader, or does not know an option.
+    CloudError
+        `strict` and the file holds invalid splats.
+    FileNotFoundError
+        There is no such file.
+
+    Warns
+    -----
+    NonFiniteWarning
+        Invalid splats were dropped, with the counts per cause.
+    """
+    path = Path(path)
+    with located(path):
+        stream, record = open_source(path)
+        try:
+            checked = read_options(record, options)
+            assert record.read is not None
+            scene = record.read(stream, checked)
+        except BaseException:
+            stream.close()
+            raise
+        if isinstance(scene, GaussianSequence):
+            weakref.finalize(scene, stream.close)  # its frames are read later
+            return scene
+        stream.close()
+        return drop_or_refuse(scene, strict=strict)
+
+
+def drop_or_refuse(cloud: GaussianCloud, *, strict: bool) -> GaussianCloud:
+    """Return the cloud without its invalid splats, or raise CloudError with `strict`."""
+    from gsplat_tools.ops.filtering import drop_invalid, refuse_invalid
+
+    if strict:
+        refuse_invalid(cloud)
+        return cloud
+    kept, dropped = drop_invalid(cloud)
+    warn_dropped(dropped, len(cloud))
+    return kept
+
+
+def warn_dropped(dropped: dict[str, int], count: int) -> None:
+    """Warn about invalid splats that were dropped, if any."""
+    if dropped:
+        causes = ", ".join(f"{cause} {number}" for cause, number in dropped.items())
+        warnings.warn(
+            NonFiniteWarning(f"dropped {sum(dropped.values())} of {count} splats that are invalid: {causes}"), stacklevel=3
+        )
+
+
+@contextmanager
+def open_chunks(path: Path, **options: Any) -> Iterator[tuple[CloudChunks | GaussianCloud | GaussianSequence, Format]]:
+    """Open a scene for one conversion: in chunks where its format allows, else read whole, invalid splats included."""
+    with located(path):
+        stream, record = open_source(path)
+        with stream:
+            checked = read_options(record, options)
+            reader = record.read_chunks or record.read
+            assert reader is not None
+            scene = reader(stream, checked)
+            if isinstance(scene, CloudChunks):
+                scene = replace(scene, iterate=partial(_located_chunks, path, scene.iterate))
+            yield scene, record
+
+
+def _located_chunks(path: Path, iterate: Callable[[], Iterator[GaussianCloud]]) -> Iterator[GaussianCloud]:
+    """Give the path to errors that appear while later chunks are read."""
+    with located(path):
+        yield from iterate()
+
+
+def inspect_file(path: str | Path) -> tuple[Format, FileInfo]:
+    """Return the format and the header facts of a file, without decoding where the format allows.
+
+    Raises
+    ------
+    FormatError
+        The bytes are at fault.
+    """
+    path = Path(path)
+    with located(path):
+        stream, record = open_source(path)
+        with stream:
+            return record, record.inspect(stream)

@@ -1,0 +1,173 @@
+"""Scenes to paths: prepare, write beside the target, check, rename."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from gsplat_tools.chunks import CloudChunks
+from gsplat_tools.errors import CapabilityError
+from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.formats._stream import stream_size
+from gsplat_tools.formats.base import Format, Scene
+from gsplat_tools.formats.loading import located
+from gsplat_tools.formats.preparing import Prepared, SaveChoices, prepare
+from gsplat_tools.formats.registry import FORMATS, find_format, format_of_extension
+from gsplat_tools.sequence import GaussianSequence
+
+DEFAULT_PRESET = "balanced"
+
+Check = Callable[[BinaryIO, Prepared, Format], None]
+"""Looks at the finished temporary file before it replaces the target; raises to keep the target as it was."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SaveReport:
+    """What `save` wrote.
+
+    Parameters
+    ----------
+    path, format, bytes
+        The target.
+    splats, sh_degree, frames
+        What it holds.
+    dropped
+        Splats left out, per cause; each counted once.
+    seconds
+        Time spent in "read" (reading and preparing the source), "encode", and "write" (sync and rename).
+    options
+        Every write option as it was used.
+    """
+
+    path: Path
+    format: str
+    bytes: int
+    splats: int
+    sh_degree: int
+    frames: int
+    dropped: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def find_target(path: Path, to: str | None) -> Format:
+    """Return the format to write to `path`.
+
+    Raises
+    ------
+    CapabilityError
+        The format is unknown, or has no writer.
+    """
+    record = find_format(to) if to is not None else format_of_extension(path)
+    if record is None:
+        extensions = sorted({e for r in FORMATS.values() if r.write is not None for e in r.extensions})
+        raise CapabilityError(
+            f"cannot tell the format from the name; give --to or use one of {', '.join(extensions)}", path=path
+        )
+    if record.write is None:
+        raise CapabilityError(f"{record.title} can be read but not written", path=path)
+    return record
+
+
+def split_options(record: Format, preset: str, options: dict[str, Any]) -> tuple[SaveChoices, Any]:
+    """Divide options into those of every format and those of this one, the preset beneath them.
+
+    Raises
+    ------
+    CapabilityError
+        The preset or an option is unknown.
+    """
+    general = {option.name for option in fields(SaveChoices)}
+    own = {option.name for option in fields(record.write_options)}
+    unknown = sorted(set(options) - general - own)
+    if unknown:
+        raise CapabilityError(
+            f"{record.title} has no option {', '.join(unknown)}; it has {', '.join(sorted(own)) or 'none of its own'}"
+        )
+    if preset != DEFAULT_PRESET and preset not in record.presets and record.presets:
+        raise CapabilityError(f"unknown preset {preset!r}; {record.title} has {', '.join(record.presets)}")
+    chosen = {**record.presets.get(preset, {}), **options}
+    choices = SaveChoices(**{name: value for name, value in chosen.items() if name in general})
+    return choices, record.write_options(**{name: value for name, value in chosen.items() if name in own})
+
+
+def save(
+    scene: Scene,
+    path: str | Path,
+    *,
+    to: str | None = None,
+    overwrite: bool = False,
+    preset: str = DEFAULT_PRESET,
+    check: Check | None = None,
+    **options: Any,
+) -> SaveReport:
+    """Save a scene; the target appears whole or not at all.
+
+    Parameters
+    ----------
+    scene
+        Cloud, sequence, or chunks.
+    path
+        Target; a temporary file is written beside it, synced and renamed.
+    to
+        Format id; by default from the extension.
+    overwrite
+        Replace a target that is there.
+    preset
+        "fast", "balanced" or "best".
+    check
+        Called with the finished temporary file before it replaces the target.
+    **options
+        Choices of `SaveChoices` and write options of the format.
+
+    Returns
+    -------
+    SaveReport
+        Bytes, counts and seconds.
+
+    Raises
+    ------
+    CapabilityError
+        The format is unknown, has no writer, cannot hold the scene, or does not know an option.
+    CloudError
+        `strict` and there are invalid splats.
+    TargetExistsError
+        The target is there and `overwrite` is false.
+
+    Warns
+    -----
+    LossyConversionWarning, NonFiniteWarning
+        What the target cannot hold, with counts.
+    """
+    path = Path(path)
+    record = find_target(path, to)
+    choices, write_options = split_options(record, preset, options)
+    assert record.write is not None
+    with located(path), replacing(path, overwrite=overwrite) as stream:
+        start = time.perf_counter()
+        prepared = prepare(scene, record, choices)
+        prepared_at = time.perf_counter()
+        record.write(prepared.scene, stream, write_options)
+        stream.flush()
+        size = stream_size(stream)
+        written_at = time.perf_counter()
+        if check is not None:
+            stream.seek(0)
+            check(stream, prepared, record)
+        checked_at = time.perf_counter()
+    done = time.perf_counter()
+    final = prepared.scene
+    return SaveReport(
+        path=path,
+        format=record.id,
+        bytes=size,
+        splats=final.num_splats if isinstance(final, GaussianSequence | CloudChunks) else len(final),
+        sh_degree=final.sh_degree,
+        frames=len(final) if isinstance(final, GaussianSequence) else 1,
+        dropped=prepared.dropped,
+        seconds={"read": prepared_at - start, "encode": written_at - prepared_at, "write": done - checked_at},
+        options={option.name: getattr(write_options, option.name) for option in fields(write_options)},
+    )
