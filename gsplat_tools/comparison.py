@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +28,7 @@ _FLOAT32_SLACK = 4e-7
 
 
 @dataclass(slots=True)
-class AttributeError_:
+class AttributeStatistics:
     """Errors of one attribute, gathered over chunks.
 
     Parameters
@@ -103,7 +103,7 @@ class ComparisonReport:
     worst_view
         Name of the view with the lowest PSNR.
     attributes
-        Errors per attribute, as `AttributeError_.to_json` gives them; empty where the splats cannot be matched.
+        Errors per attribute, as `AttributeStatistics.to_json` gives them; empty where the splats cannot be matched.
     views
         One report a view.
     model
@@ -192,7 +192,7 @@ class AttributeTally:
     """Errors of all attributes, gathered chunk by chunk."""
 
     def __init__(self) -> None:
-        self.attributes: dict[str, AttributeError_] = {}
+        self.attributes: dict[str, AttributeStatistics] = {}
 
     def add(self, reference: GaussianCloud, candidate: GaussianCloud, bounds: Bounds | None = None) -> None:
         """Take one more pair of chunks into account."""
@@ -202,7 +202,7 @@ class AttributeTally:
             if bound is not None:
                 bound = np.broadcast_to(np.asarray(bound, np.float64), errors.shape)
                 bound = bound + _slack(name, reference, bound)
-            self.attributes.setdefault(name, AttributeError_()).add(errors, bound)
+            self.attributes.setdefault(name, AttributeStatistics()).add(errors, bound)
 
     def exceeded(self) -> list[str]:
         """Return one phrase for every attribute that leaves its bound."""
@@ -413,19 +413,24 @@ def match_splats(reference: GaussianCloud, candidate: GaussianCloud) -> NDArray[
 
     Notes
     -----
-    Splats of the same order are recognized by their positions; otherwise both are sorted by position, which pairs
-    them wherever rounding has not exchanged neighbors. None where the counts differ.
+    Two orders are tried: that of the reference, and the Morton order that encoders give their splats. None where the
+    counts differ or neither brings most splats near their counterparts.
     """
+    from gsplat_tools.ops.ordering import splat_order
+
     if len(reference) != len(candidate) or len(reference) == 0:
         return None
     world = reference.means + (reference.origin - candidate.origin)
-    extent = float(np.ptp(world, axis=0).max()) or 1.0
-    tolerance = 1e-3 * extent
-    if np.median(np.abs(world - candidate.means).max(axis=1)) <= tolerance:
+    tolerance = 1e-3 * (float(np.ptp(world, axis=0).max()) or 1.0)
+
+    def is_near(order: slice | NDArray[Any]) -> bool:
+        return bool(np.median(np.abs(world[order] - candidate.means).max(axis=1)) <= tolerance)
+
+    if is_near(slice(None)):
         return slice(None)
-    a, b = np.lexsort(world.T), np.lexsort(candidate.means.T)
-    matched = np.empty(len(a), np.intp)
-    matched[a] = b
-    if np.median(np.abs(world - candidate.means[matched]).max(axis=1)) <= tolerance:
+    order = splat_order(reference, "morton")
+    if is_near(order):
+        matched = np.empty(len(order), np.intp)
+        matched[order] = np.arange(len(order))
         return matched
     return None

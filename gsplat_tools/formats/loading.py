@@ -16,7 +16,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning
 from gsplat_tools.formats._stream import seekable
 from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format
-from gsplat_tools.formats.registry import detect
+from gsplat_tools.formats.registry import detect, find_format
 from gsplat_tools.sequence import GaussianSequence
 
 
@@ -135,18 +135,23 @@ def warn_dropped(dropped: dict[str, int], count: int) -> None:
 
 
 @contextmanager
-def open_chunks(path: Path, **options: Any) -> Iterator[tuple[CloudChunks | GaussianCloud | GaussianSequence, Format]]:
-    """Open a scene for one conversion: in chunks where its format allows, else read whole, invalid splats included."""
+def open_scene(
+    path: Path, *, in_chunks: bool, as_format: str | None = None, **options: Any
+) -> Iterator[CloudChunks | GaussianCloud | GaussianSequence]:
+    """Open a scene for one conversion, invalid splats included: in chunks if asked for and its format allows, else whole."""
     with located(path):
-        stream, record = open_source(path)
+        if as_format is None:
+            stream, record = open_source(path)
+        else:
+            stream, record = path.open("rb"), find_format(as_format)
         with stream:
             checked = read_options(record, options)
-            reader = record.read_chunks or record.read
+            reader = (record.read_chunks if in_chunks else None) or record.read
             assert reader is not None
             scene = reader(stream, checked)
             if isinstance(scene, CloudChunks):
                 scene = replace(scene, iterate=partial(_located_chunks, path, scene.iterate))
-            yield scene, record
+            yield scene
 
 
 def _located_chunks(path: Path, iterate: Callable[[], Iterator[GaussianCloud]]) -> Iterator[GaussianCloud]:

@@ -1,0 +1,282 @@
+"""One conversion from path to path: load, prepare, write, read back, hold against bounds, render, publish."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from gsplat_tools.chunks import CloudChunks
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.comparison import AttributeTally, compare_rendered, paired, sample
+from gsplat_tools.errors import CapabilityError, GsplatWarning, ValidationError
+from gsplat_tools.formats.base import Format, Scene
+from gsplat_tools.formats.loading import open_scene
+from gsplat_tools.formats.preparing import Prepared
+from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, save
+from gsplat_tools.progress import stage
+from gsplat_tools.sequence import GaussianSequence, Interpolation
+
+VALIDATION_VIEWS = 2
+VALIDATION_SIZE = (320, 180)
+VALIDATED_FRAMES = 3
+"""Frames of a sequence that are rendered: the first, the middle and the last; the bounds hold for all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Validation:
+    """How a written file is checked before it replaces its target.
+
+    Parameters
+    ----------
+    views, size
+        Automatic views and their width and height, px.
+    model
+        Rendering model; by default the one that stands for the target.
+    min_psnr
+        Lowest acceptable PSNR of the worst view, dB.
+    """
+
+    views: int = VALIDATION_VIEWS
+    size: tuple[int, int] = VALIDATION_SIZE
+    model: str | None = None
+    min_psnr: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConversionReport:
+    """What one conversion did; `to_json` is what `gsplat-convert --json` prints."""
+
+    source: str
+    path: Path
+    format: str
+    bytes: int
+    splats: int
+    sh_degree: int
+    frames: int
+    dropped: dict[str, int]
+    warnings: list[dict[str, str]]
+    seconds: dict[str, float]
+    validation: dict[str, Any] | None
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the report with the fixed names of the command line's JSON."""
+        return {
+            "source": self.source,
+            "target": {"path": str(self.path), "format": self.format, "bytes": self.bytes},
+            "splats": self.splats,
+            "sh_degree": self.sh_degree,
+            "frames": self.frames,
+            "dropped": self.dropped,
+            "warnings": self.warnings,
+            "seconds": {name: round(value, 4) for name, value in self.seconds.items()},
+            "validation": self.validation,
+            "options": {
+                name: value if isinstance(value, int | float | str | None) else str(value)
+                for name, value in self.options.items()
+            },
+        }
+
+
+def convert(
+    sources: Sequence[str | Path],
+    target: str | Path,
+    *,
+    to: str | None = None,
+    overwrite: bool = False,
+    preset: str = DEFAULT_PRESET,
+    validation: Validation | None = Validation(),  # noqa: B008 - frozen
+    time_at: float | None = None,
+    frame: int | None = None,
+    interpolation: Interpolation = "linear",
+    read_options: dict[str, Any] | None = None,
+    **options: Any,
+) -> ConversionReport:
+    """Convert a file, or several files as the frames of a sequence, to one target.
+
+    Parameters
+    ----------
+    sources
+        One file, or frames: several files, a folder, or a glob.
+    target
+        File to write.
+    to
+        Format id; by default from the target's extension.
+    overwrite
+        Replace a target that is there.
+    preset
+        "fast", "balanced" or "best".
+    validation
+        How to check the written file; None checks nothing.
+    time_at, frame, interpolation
+        Take one moment or one stored frame of a sequence.
+    read_options
+        Read options of the source's format.
+    **options
+        Choices of `SaveChoices` and write options of the target's format.
+
+    Returns
+    -------
+    ConversionReport
+        Counts, bytes, seconds, warnings and the validation.
+
+    Raises
+    ------
+    GsplatError
+        See `load` and `save`.
+    ValidationError
+        The written file leaves its bounds, or renders below `min_psnr`; the target is left as it was.
+    """
+    record = find_target(Path(target), to)
+    outcome: dict[str, Any] = {}
+    seconds = {"read": 0.0, "encode": 0.0, "write": 0.0, "validate": 0.0}
+
+    def check(stream: BinaryIO, prepared: Prepared, written: Format) -> None:
+        assert validation is not None
+        start = time.perf_counter()
+        outcome["validation"] = _validate(Path(stream.name), prepared.scene, written, validation)
+        seconds["validate"] = time.perf_counter() - start
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", GsplatWarning)
+        start = time.perf_counter()
+        in_chunks = record.streams and (options.get("order") or record.order) == "none"
+        with _open(sources, in_chunks, read_options or {}, options) as opened:
+            scene = _at_moment(opened, time_at, frame, interpolation)
+            seconds["read"] = time.perf_counter() - start
+            saved = save(
+                scene,
+                target,
+                to=record.id,
+                overwrite=overwrite,
+                preset=preset,
+                check=None if validation is None else check,
+                **options,
+            )
+    for name, spent in saved.seconds.items():
+        seconds[name] += spent
+    return ConversionReport(
+        source=", ".join(map(str, sources)),
+        path=saved.path,
+        format=saved.format,
+        bytes=saved.bytes,
+        splats=saved.splats,
+        sh_degree=saved.sh_degree,
+        frames=saved.frames,
+        dropped=saved.dropped,
+        warnings=_unique_warnings(caught),
+        seconds=seconds,
+        validation=outcome.get("validation"),
+        options=saved.options,
+    )
+
+
+@contextmanager
+def _open(
+    sources: Sequence[str | Path], in_chunks: bool, read_options: dict[str, Any], options: dict[str, Any]
+) -> Iterator[Scene]:
+    """Open one file, or several, a folder or a glob as a sequence."""
+    if len(sources) == 1 and Path(sources[0]).is_file():
+        with open_scene(Path(sources[0]), in_chunks=in_chunks, **read_options) as scene:
+            yield scene
+        return
+    from gsplat_tools.formats.sequences import open_sequence
+
+    yield open_sequence(sources, frame_times=options.pop("frame_times", None))
+
+
+def _at_moment(scene: Scene, time_at: float | None, frame: int | None, interpolation: Interpolation) -> Scene:
+    """Return one moment of a sequence if one was asked for."""
+    if time_at is None and frame is None:
+        return scene
+    if time_at is not None and frame is not None:
+        raise CapabilityError("give a time or a frame, not both")
+    if not isinstance(scene, GaussianSequence):
+        raise CapabilityError("the source is not a sequence; leave out --time and --frame")
+    return scene.frame(frame) if frame is not None else scene.at(float(time_at or 0.0), interpolation)
+
+
+def _validate(
+    path: Path, source: GaussianCloud | CloudChunks | GaussianSequence, target: Format, how: Validation
+) -> dict[str, Any]:
+    """Read the file back, hold every value against its bound, render both sides, and judge.
+
+    Raises
+    ------
+    ValidationError
+        A bound is exceeded, or the worst view is below `min_psnr`.
+    """
+    from gsplat_tools.reference.auto_cameras import auto_cameras
+
+    if target.read is None:
+        raise CapabilityError(f"{target.title} cannot be read back; use --no-validate")
+    tally = AttributeTally()
+    pairs: list[tuple[str, GaussianCloud, GaussianCloud]] = []
+    in_chunks = not isinstance(source, GaussianSequence)
+    with open_scene(path, in_chunks=in_chunks, as_format=target.id) as decoded, path.open("rb") as header:
+        if isinstance(source, GaussianSequence) != isinstance(decoded, GaussianSequence):
+            if isinstance(decoded, GaussianSequence) and not isinstance(source, GaussianSequence):
+                source = still_sequence(source)
+            else:
+                raise ValidationError("a sequence was written but a single frame was read back")
+        if isinstance(source, GaussianSequence) and isinstance(decoded, GaussianSequence):
+            rendered = set(np.linspace(0, len(source) - 1, VALIDATED_FRAMES).round().astype(int).tolist())
+            with stage("checking", len(source), "frames") as progress:
+                for frame_id in range(len(source)):
+                    a, b = source.frame(frame_id), decoded.frame(frame_id)
+                    tally.add(a, b, None if target.bounds is None else target.bounds(a, header, frame_id))
+                    if frame_id in rendered:
+                        pairs.append((f"frame {frame_id} " if len(source) > 1 else "", a, b))
+                    progress.advance(1)
+        elif not isinstance(source, GaussianSequence) and not isinstance(decoded, GaussianSequence):
+            if len(source) != len(decoded):
+                raise ValidationError(f"{len(source)} splats were written but {len(decoded)} read back")
+            with stage("checking", len(source)) as progress:
+                for a, b in paired(source, decoded):
+                    tally.add(a, b, None if target.bounds is None else target.bounds(a, header, 0))
+                    progress.advance(len(a))
+            pairs.append(("", sample(source), sample(decoded)))
+    model = (how.model, None) if how.model is not None else target.model
+    result: dict[str, Any] = {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None}
+    pairs = [pair for pair in pairs if len(pair[1])]
+    if pairs and how.views > 0:
+        cameras = auto_cameras(pairs[0][1], views=how.views, size=how.size)
+        report, _ = compare_rendered(pairs, cameras, model)
+        result = {name: getattr(report, name) for name in ("psnr_min", "psnr_mean", "ssim_mean", "max_abs", "identical")}
+        result |= {"worst_view": report.worst_view, "model": report.model, "rendered_splats": report.rendered_splats}
+    exceeded = tally.exceeded()
+    psnr_min = result["psnr_min"]
+    too_low = how.min_psnr is not None and psnr_min is not None and psnr_min < how.min_psnr
+    if exceeded:
+        raise ValidationError(f"what was written leaves its derived bounds: {'; '.join(exceeded)}")
+    if too_low:
+        raise ValidationError(
+            f"the worst view has {psnr_min:.2f} dB, below --min-psnr {how.min_psnr:g}; the target is left as it was. "
+            "Use --preset best or a lower --min-psnr"
+        )
+    return {**result, "attributes": tally.to_json(), "passed": True}
+
+
+def still_sequence(scene: GaussianCloud | CloudChunks) -> GaussianSequence:
+    """Return a still scene as a sequence of one frame."""
+    cloud = scene.read() if isinstance(scene, CloudChunks) else scene
+    return GaussianSequence(lambda _frame: cloud, num_splats=len(cloud), sh_degree=cloud.sh_degree, num_frames=1)
+
+
+def _unique_warnings(caught: Sequence[warnings.WarningMessage]) -> list[dict[str, str]]:
+    """Return our warnings as code and message, each once; pass everyone else's on."""
+    messages: dict[tuple[str, str], dict[str, str]] = {}
+    for warning in caught:
+        if isinstance(warning.message, GsplatWarning):
+            entry = {"code": warning.message.code, "message": str(warning.message)}
+            messages.setdefault((entry["code"], entry["message"]), entry)
+        else:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    return list(messages.values())
