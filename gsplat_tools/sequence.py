@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.attributes.activations import logit, sigmoid
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.constants import VISIBLE_OPACITY
 from gsplat_tools.errors import CloudError
@@ -151,20 +152,10 @@ class GaussianSequence:
         return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
 
 
-def _sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float64]:
-    with np.errstate(over="ignore"):
-        return 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
-
-
-def _logit(opacities: NDArray[np.float64]) -> NDArray[np.float32]:
-    with np.errstate(divide="ignore"):
-        return (np.log(opacities) - np.log1p(-opacities)).astype(np.float32)
-
-
 def _gate_opacity(cloud: GaussianCloud) -> GaussianCloud:
     """Turn opacities below 1/255 into 0."""
     # A stored byte of 1 must pass although sigmoid(logit(1/255)) rounds either way.
-    hidden = _sigmoid(cloud.opacity_logits) < VISIBLE_OPACITY * (1 - 1e-6)
+    hidden = sigmoid(cloud.opacity_logits.astype(np.float64)) < VISIBLE_OPACITY * (1 - 1e-6)
     logits = np.where(hidden, np.float32(-np.inf), cloud.opacity_logits)
     return cloud.replace(opacity_logits=logits)
 
@@ -179,12 +170,12 @@ def _interpolate(a: GaussianCloud, b: GaussianCloud, fraction: np.float32) -> Ga
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     is_null = norms < _MIN_QUAT_NORM
     quats = np.where(is_null, np.array([1, 0, 0, 0], np.float32), quats / np.where(is_null, 1, norms))
-    opacities = _sigmoid(a.opacity_logits) * float(keep) + _sigmoid(b.opacity_logits) * float(fraction)
+    opacities = sigmoid(a.opacity_logits.astype(np.float64)) * keep + sigmoid(b.opacity_logits.astype(np.float64)) * fraction
     return a.replace(
         means=a.means * keep + b.means * fraction,
         log_scales=log_scales,
         quats=quats.astype(np.float32),
-        opacity_logits=_logit(np.clip(opacities, 0.0, 1.0)),
+        opacity_logits=logit(np.clip(opacities, 0.0, 1.0)),
         sh0=a.sh0 * keep + b.sh0 * fraction,
         shN=a.shN * keep + b.shN * fraction,
     )
