@@ -1,0 +1,113 @@
+// What the page can be asked to do: each exported function takes (settings, blobs) and returns {report, bytes}.
+import { PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+import * as THREE from "three";
+
+let renderer;
+
+/** Draw the words that Python handed over, as they are; the pixels come back as RGBA bytes, bottom row first. */
+export async function drawPacked(settings, blobs) {
+  const extra = {};
+  for (const band of ["sh1", "sh2", "sh3"]) {
+    if (blobs[band]) extra[band] = new Uint32Array(blobs[band]);
+  }
+  const splats = new PackedSplats({
+    packedArray: new Uint32Array(blobs.packed),
+    numSplats: settings.numSplats,
+    extra,
+    ...(settings.splatEncoding ? { splatEncoding: settings.splatEncoding } : {}),
+  });
+  return draw(splats, settings);
+}
+
+/** What is drawing: versions and the GL behind the pixels. */
+export async function describeRenderer() {
+  const gl = getRenderer().getContext();
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  return {
+    report: {
+      three: THREE.REVISION,
+      agent: navigator.userAgent,
+      gl: gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER),
+      maxTextureSize: gl.getParameter(gl.MAX_TEXTURE_SIZE),
+    },
+  };
+}
+
+/** The defaults of SparkRenderer, as it reports them itself. */
+export async function sparkDefaults() {
+  const spark = new SparkRenderer({ renderer: getRenderer() });
+  const report = {};
+  for (const [name, value] of Object.entries(spark)) {
+    if (["number", "boolean"].includes(typeof value)) report[name] = value;
+  }
+  report.premultipliedAlpha = spark.premultipliedAlpha;
+  spark.dispose();
+  return { report };
+}
+
+async function draw(splats, { camera: given, options, background }) {
+  const canvas = getRenderer();
+  canvas.setSize(given.width, given.height, false);
+  canvas.setClearColor(new THREE.Color().setRGB(...background.slice(0, 3), THREE.SRGBColorSpace), background[3]);
+
+  // autoUpdate off: the order is brought up to date here, once, before anything is drawn, and not while drawing.
+  const spark = new SparkRenderer({ renderer: canvas, enableLod: false, ...options, autoUpdate: false });
+  const mesh = new SplatMesh({ packedSplats: splats });
+  const scene = new THREE.Scene();
+  scene.add(spark, mesh);
+  try {
+    await mesh.initialized;
+    const camera = toThreeCamera(given);
+    scene.updateMatrixWorld(true);
+    await spark.update({ scene, camera });
+    await sorted(spark);
+    canvas.render(scene, camera);
+    const gl = canvas.getContext();
+    const bytes = new Uint8Array(4 * given.width * given.height);
+    gl.readPixels(0, 0, given.width, given.height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    const error = gl.getError();
+    if (error !== gl.NO_ERROR) throw new Error(`WebGL error ${error}`);
+    return { report: { numSplats: splats.numSplats, numSh: splats.getNumSh(), activeSplats: spark.activeSplats }, bytes };
+  } finally {
+    scene.remove(spark, mesh);
+    mesh.dispose();
+    spark.dispose();
+  }
+}
+
+/** Wait until Spark's worker has sorted the splats for the camera of the last update. */
+async function sorted(spark) {
+  while (spark.sorting || spark.sortDirty || spark.display !== spark.current) {
+    await new Promise((resolve) => setTimeout(resolve, 1));
+  }
+}
+
+/**
+ * A three.js camera (x right, y up, looking along -z) from a world-to-camera matrix with axes RDF and a K in pixels.
+ * The matrices are set as they are: nothing is rounded through angles.
+ */
+function toThreeCamera({ viewmat, K, width, height, near, far }) {
+  const camera = new THREE.PerspectiveCamera(45, width / height, near, far);
+  const flip = new THREE.Matrix4().makeScale(1, -1, -1);
+  camera.matrixAutoUpdate = false;
+  camera.matrix.set(...viewmat).premultiply(flip).invert();
+  camera.updateMatrixWorld(true);
+  const [fx, , cx, , fy, cy] = K;
+  const depth = far - near;
+  camera.projectionMatrix.set(
+    (2 * fx) / width, 0, 1 - (2 * cx) / width, 0,
+    0, (2 * fy) / height, (2 * cy) / height - 1, 0,
+    0, 0, -(far + near) / depth, (-2 * far * near) / depth,
+    0, 0, -1, 0,
+  );
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+  return camera;
+}
+
+function getRenderer() {
+  if (!renderer) {
+    renderer = new THREE.WebGLRenderer({ antialias: false, alpha: true, premultipliedAlpha: true });
+    renderer.setPixelRatio(1);
+  }
+  return renderer;
+}
