@@ -1,0 +1,69 @@
+"""Quaternions in four bytes w x y z, value (b - 128) / 128; the decoder normalizes (.sog4d, .splat4d, .splat)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.errors import CloudError
+from gsplat_tools.parallel import run_blocks
+
+Mode = Literal["best", "reference"]
+
+MAX_ANGLE = 2.0 * float(np.arcsin(1.0 / 127.0))
+"""Largest rotation error of both modes, in radians (0.902 degrees).
+
+Rounding leaves a residual of at most half a step in each of four components, so of at most one step in all, on a ray of
+at least 127.49 ("best", saturation) or 128 steps ("reference"); a rotation turns by twice the angle of its quaternion.
+Where "reference" clamps 128 to 127 the other components span at most 11.3 steps, so that of the clamped step 0.09 lies
+across the ray and the residual across it is at most sqrt(3) / 2 + 0.09 steps.
+"""
+
+
+def encode(quats: NDArray[np.floating[Any]], *, mode: Mode = "best") -> NDArray[np.uint8]:
+    """Quantize rotations to four bytes.
+
+    Parameters
+    ----------
+    quats
+        (N, 4) wxyz, of any length; length 0 is taken as the identity.
+    mode
+        "reference" rounds the unit quaternion; "best" also searches the length that is stored, which decoders
+        normalize away, for the smallest angle, and stores w >= 0.
+
+    Returns
+    -------
+    NDArray[np.uint8]
+        (N, 4) codes w x y z.
+
+    Raises
+    ------
+    CloudError
+        A component is not finite.
+    """
+    from gsplat_tools.kernels import quaternion_u8 as kernels
+
+    if mode not in get_args(Mode):
+        raise ValueError(f"mode must be one of {get_args(Mode)}, got {mode!r}")
+    values = np.ascontiguousarray(quats, np.float32)
+    if values.ndim != 2 or values.shape[1] != 4:
+        raise ValueError(f"quats must have shape (N, 4), got {values.shape}")
+    if not np.isfinite(values).all():
+        bad = int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
+        raise CloudError(f"{bad} of {len(values)} quaternions are not finite; drop them first", field="quats")
+    codes = np.empty(values.shape, np.uint8)
+    quantize = kernels.quantize_best if mode == "best" else kernels.quantize_reference
+    run_blocks(lambda start, stop: quantize(values[start:stop], codes[start:stop]), len(values))
+    return codes
+
+
+def decode(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the unit quaternions, wxyz with w >= 0, that (N, 4) codes stand for; (128, 128, 128, 128) is the identity."""
+    values = (codes.astype(np.float32) - 128) / 128
+    squares = np.square(values).sum(axis=1, keepdims=True)
+    is_null = squares == 0
+    lengths = np.sqrt(np.where(is_null, np.float32(1), squares))
+    unit = values / np.where(values[:, :1] < 0, -lengths, lengths)
+    return np.where(is_null, np.array([1, 0, 0, 0], np.float32), unit).astype(np.float32)
