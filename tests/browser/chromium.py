@@ -80,33 +80,30 @@ class Chromium:
     """
 
     def __init__(self, *, timeout: float = 60.0) -> None:
+        path = executable()
+        if path is None:
+            raise BrowserError("Chromium is not installed")
         self.timeout = timeout
         self._jobs: queue.Queue[dict[str, Any]] = queue.Queue()
         self._results: queue.Queue[tuple[str, bytes]] = queue.Queue()
         self._blobs: dict[str, bytes] = {}
         self._last_id = 0
         self._closing = threading.Event()
-        self._folder = tempfile.TemporaryDirectory(prefix="gsplat-tools-chromium-")
         self._server = _Server(self)
         self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
         self._thread.start()
-        path = executable()
-        if path is None:
-            raise BrowserError("Chromium is not installed")
-        self._log = Path(self._folder.name, "log").open("w+b")
-        self._process = subprocess.Popen(
-            [
-                path,
-                *FLAGS,
-                f"--user-data-dir={self._folder.name}/profile",
-                f"http://127.0.0.1:{self._server.server_address[1]}/page.html",
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=self._log,
-            stderr=self._log,
-            # Its own process group, so that closing ends the helper processes as well and nothing else.
-            start_new_session=True,
-        )
+        self._folder = Path(tempfile.mkdtemp(prefix="gsplat-tools-chromium-"))
+        self._log = self._folder / "log"
+        page = f"http://127.0.0.1:{self._server.server_address[1]}/page.html"
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [path, *FLAGS, f"--user-data-dir={self._folder / 'profile'}", page],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                # Its own process group, so that closing ends the helper processes as well and nothing else.
+                start_new_session=True,
+            )
 
     def call(self, name: str, settings: Mapping[str, Any] | None = None, **blobs: bytes) -> tuple[dict[str, Any], bytes]:
         """Run `name` of jobs.mjs in the page and return its report and its bytes.
@@ -142,14 +139,12 @@ class Chromium:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-        self._log.close()
         # A helper process may still write into the profile for a moment.
         for _ in range(50):
-            with contextlib.suppress(OSError):
-                shutil.rmtree(self._folder.name)
+            shutil.rmtree(self._folder, ignore_errors=True)
+            if not self._folder.exists():
                 break
             time.sleep(0.1)
-        self._folder.cleanup()
 
     def __enter__(self) -> Chromium:
         return self
@@ -173,7 +168,7 @@ class Chromium:
 
     def _last_words(self) -> str:
         """Return the end of what Chromium wrote."""
-        return Path(self._log.name).read_bytes()[-2000:].decode(errors="replace").strip() or "(nothing)"
+        return self._log.read_bytes()[-2000:].decode(errors="replace").strip() or "(nothing)"
 
 
 class _Server(ThreadingHTTPServer):

@@ -52,7 +52,8 @@ async function draw(splats, { camera: given, options, background }) {
 
   // autoUpdate off: the order is brought up to date here, once, before anything is drawn, and not while drawing.
   const spark = new SparkRenderer({ renderer: canvas, enableLod: false, ...options, autoUpdate: false });
-  const mesh = new SplatMesh({ packedSplats: splats });
+  // SplatMesh overwrites the encoding of the PackedSplats it is given, with the defaults if it is told nothing.
+  const mesh = new SplatMesh({ packedSplats: splats, splatEncoding: splats.splatEncoding });
   const scene = new THREE.Scene();
   scene.add(spark, mesh);
   try {

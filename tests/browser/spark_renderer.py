@@ -52,7 +52,7 @@ def draw_with_spark(
     encoding
         Spark's `splatEncoding`: rgbMin, rgbMax, lnScaleMin, lnScaleMax, sh1Max, sh2Max, sh3Max. None: Spark's defaults.
     options
-        Options of SparkRenderer under their own names (accumExtSplats, sortRadial, blurAmount, ...). LoD is off unless asked for.
+        Options of SparkRenderer under their own names (accumExtSplats, sortRadial, blurAmount, ...). LoD is off by default.
     background
         RGBA 0..1, as bytes of the canvas are to hold it.
 
