@@ -13,8 +13,8 @@ from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.sequence import GaussianSequence
 
-SNIFF_BYTES = 64
-"""Bytes from the start of a file that are enough to recognize every format that has a signature."""
+SNIFF_BYTES = 4096
+"""Bytes from the start of a file that are enough to recognize every format; PLY dialects differ behind the comments."""
 
 Scene = GaussianCloud | GaussianSequence | CloudChunks
 """What a writer takes; only formats with `streams` take chunks, only those with `holds_sequences` take sequences."""
