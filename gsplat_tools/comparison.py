@@ -200,8 +200,8 @@ class AttributeTally:
         for name, errors in attribute_errors(reference, candidate).items():
             bound = bounds.get(name)
             if bound is not None:
-                bound = np.broadcast_to(np.asarray(bound, np.float64), errors.shape)
-                bound = bound + _slack(name, reference, bound)
+                widened = np.broadcast_to(np.asarray(bound, np.float64), errors.shape)
+                bound = widened + _slack(name, reference, widened)
             self.attributes.setdefault(name, AttributeStatistics()).add(errors, bound)
 
     def exceeded(self) -> list[str]:

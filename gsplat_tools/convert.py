@@ -92,7 +92,7 @@ def convert(
     to: str | None = None,
     overwrite: bool = False,
     preset: str = DEFAULT_PRESET,
-    validation: Validation | None = Validation(),  # noqa: B008 - frozen
+    validation: Validation | None = Validation(),
     time_at: float | None = None,
     frame: int | None = None,
     interpolation: Interpolation = "linear",

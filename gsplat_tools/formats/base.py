@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +133,7 @@ class Format:
     stores_coordinates: bool = False
     stores_splat_model: bool = False
     streams: bool = False
-    order: str = "none"
+    order: Literal["morton", "hilbert2d", "none"] = "none"
     required_coordinates: str | None = None
     position_type: str = "f32"
     read_options: type = NoOptions

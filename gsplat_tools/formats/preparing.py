@@ -51,7 +51,7 @@ class SaveChoices:
 
     sh_degree: int | Literal["auto"] | None = None
     prune_opacity: float = 0.0
-    order: str | None = None
+    order: Literal["morton", "hilbert2d", "none"] | None = None
     source_coordinates: str | None = None
     target_coordinates: str | None = None
     recenter: Literal["auto", "on", "off"] = "auto"

@@ -1,0 +1,105 @@
+"""Click options and types that the commands share; choices of formats are read from the registry."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gsplat_tools.formats.registry import FORMATS
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+EXISTING_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+MODELS = ("inria", "unity", "spark", "visionary")
+AXES = "axis letters such as RUB, RDF, RUF or LUF"
+
+
+class SizeType(click.ParamType[tuple[int, int]]):
+    """WxH in pixels."""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Return (width, height)."""
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", str(value))
+        if not match or "0" in match.groups():
+            self.fail(f"{value!r} is not a size such as 1280x720", param, ctx)
+        return int(match[1]), int(match[2])
+
+
+class DegreeType(click.ParamType[int | str]):
+    """0 to 4, or auto."""
+
+    name = "0..4|auto"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        """Return the degree or "auto"."""
+        if value == "auto":
+            return "auto"
+        if str(value) not in {"0", "1", "2", "3", "4"}:
+            self.fail(f"{value!r} is not 0 to 4 or auto", param, ctx)
+        return int(value)
+
+
+class FrameTimesType(click.ParamType[list[float]]):
+    """A comma-separated list, or a file of one number a line."""
+
+    name = "FILE|LIST"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> list[float]:
+        """Return the times."""
+        if isinstance(value, list):
+            return value
+        text = Path(value).read_text(encoding="utf-8") if Path(value).is_file() else str(value)
+        try:
+            return [float(word) for word in re.split(r"[,\s]+", text.strip()) if word]
+        except ValueError:
+            self.fail(f"{value!r} is neither a file of numbers nor a list such as 0,0.5,1", param, ctx)
+
+
+def format_ids(capability: str) -> list[str]:
+    """Return the ids of formats that can `read` or `write`."""
+    return [record.id for record in FORMATS.values() if getattr(record, capability) is not None]
+
+
+def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --json."""
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")(function)
+
+
+def progress_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --progress/--no-progress."""
+    return click.option("--progress/--no-progress", default=True, help="Show what takes longer than a second, on stderr.")(
+        function
+    )
+
+
+def jobs_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --jobs."""
+    return click.option("--jobs", type=click.IntRange(min=1), help="Threads to use; the result does not depend on it.")(
+        function
+    )
+
+
+def version_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --version, which also names the WebP library that images are made with."""
+
+    def show(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
+        if not value or ctx.resilient_parsing:
+            return
+        from PIL import features
+
+        import gsplat_tools
+
+        click.echo(f"gsplat_tools {gsplat_tools.__version__} (libwebp {features.version('webp') or 'missing'})")
+        ctx.exit()
+
+    return click.option(
+        "--version", is_flag=True, expose_value=False, is_eager=True, callback=show, help="Show the version and exit."
+    )(function)

@@ -1,0 +1,95 @@
+"""JSON or words; progress on stderr."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+from gsplat_tools.progress import Stage, report_to
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON object on stdout; numbers that are not finite become null."""
+    click.echo(json.dumps(finite(value), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def finite(value: Any) -> Any:
+    """Return the value with every number that JSON cannot hold replaced by None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return value
+
+
+@contextmanager
+def showing_progress(show: bool) -> Iterator[None]:
+    """Show stages that last over a second on stderr, and say when kernels are compiled for the first time."""
+    from gsplat_tools.kernels._jit import announce_compilation
+
+    if not show:
+        yield
+        return
+    announce_compilation(
+        lambda: click.echo("compiling kernels for first use, which takes some seconds; later runs load them", err=True)
+    )
+    with report_to(_bar):
+        yield
+
+
+def _bar(label: str, total: int, unit: str) -> Stage:
+    """Return a progress bar that appears after a second."""
+    from tqdm import tqdm
+
+    interval = 0.1 if sys.stderr.isatty() else 10.0
+
+    class Bar:
+        def __init__(self) -> None:
+            self._bar = tqdm(
+                desc=label,
+                total=total or None,
+                unit=f" {unit}",
+                unit_scale=total > 10_000,
+                delay=1.0,
+                mininterval=interval,
+                leave=False,
+                file=sys.stderr,
+                dynamic_ncols=True,
+            )
+
+        def advance(self, amount: int) -> None:
+            self._bar.update(amount)
+
+        def close(self) -> None:
+            self._bar.close()
+
+    return Bar()
+
+
+def count(number: int) -> str:
+    """Return a number with thousands separated."""
+    return f"{number:,}"
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Return a number for people; a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def table(rows: list[tuple[str, ...]], header: tuple[str, ...]) -> str:
+    """Return rows as aligned columns; the first is left, the others right aligned."""
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+
+    def line(row: tuple[str, ...]) -> str:
+        cells = [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        return "  ".join(cells).rstrip()
+
+    return "\n".join([line(header), line(tuple("-" * width for width in widths)), *map(line, rows)])

@@ -1,0 +1,248 @@
+"""gsplat-convert: parse, call `convert`, print."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gsplat_tools.cli import _options as options
+from gsplat_tools.cli import _output as output
+from gsplat_tools.cli._errors import one_line, reports_errors
+from gsplat_tools.formats.base import Format
+from gsplat_tools.formats.preparing import SaveChoices
+from gsplat_tools.formats.registry import FORMATS
+from gsplat_tools.formats.saving import find_target
+
+# Options of single formats: flag, field of the write options, click arguments. A format takes those that its
+# write options name; naming one for a format that does not have it is a usage error.
+FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("--rotation", "rotation", {
+        "type": click.Choice(["reference", "best", "small"]),
+        "help": "Rotation codes: as the target's own encoder, with the smallest error, or as compresses best.",
+    }),
+    ("--spark-encoding", "spark_encoding", {
+        "type": click.Choice(["default", "fit"]), "help": "Ranges of the Spark pack: Spark's own, or fitted to the scene.",
+    }),
+    ("--codec", "codec", {"type": click.Choice(["zstd", "none"]), "help": "Streams of .gspk; none can be memory-mapped."}),
+    ("--sog4d-version", "version", {"type": click.IntRange(1, 2), "help": "SH palette: one (1) or one a band (2)."}),
+    ("--labels", "labels", {"type": click.Choice(["full", "delta-v1"]), "help": "SH labels of .sog4d sequences."}),
+    ("--delta-segment-length", "delta_segment_length", {"type": click.IntRange(min=1), "help": "Frames a delta segment."}),
+    ("--time-mapping", "time_mapping", {"type": click.Choice(["uniform", "explicit"]), "help": "Times of .sog4d frames."}),
+    ("--scale-codebook-size", "scale_codebook_size", {"type": click.IntRange(1, 65535), "help": "Scale triples of .sog4d."}),
+    ("--sh-palette-size", "sh_palette_size", {"type": click.IntRange(1, 65536), "help": "Entries of the SH palette."}),
+    ("--centroids", "centroids", {"type": click.Choice(["f16", "f32"]), "help": "Type of the SH palette."}),
+    ("--sh0-codebook", "sh0_codebook", {"type": click.Choice(["base-rgb", "fit"]), "help": "Fixed or fitted base colors."}),
+    ("--webp-effort", "webp_effort", {"type": click.IntRange(0, 9), "help": "Effort of the lossless WebP images."}),
+    ("--zip", "zip", {"type": click.Choice(["auto", "stored", "deflated"]), "help": "auto: images stored, the rest deflated."}),
+    ("--seed", "seed", {"type": int, "help": "Seed of everything random."}),
+)  # fmt: skip
+
+
+def _format_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of single formats."""
+    for flag, name, arguments in reversed(FORMAT_OPTIONS):
+        parameter = f"own_{flag.strip('-').replace('-', '_')}"
+        known = [record.id for record in FORMATS.values() if name in _own_fields(record)]
+        if known:
+            text = f"{arguments['help']} [{', '.join(known)}]"
+            command = click.option(flag, parameter, **{**arguments, "help": text})(command)
+    return command
+
+
+def _own_fields(record: Format) -> set[str]:
+    """Return the names of a format's own write options."""
+    return {option.name for option in fields(record.write_options)} if record.write is not None else set()
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.argument("sources", nargs=-1, required=True, metavar="SOURCE...")
+@click.argument("target", type=click.Path(path_type=Path))
+@click.option(
+    "--to",
+    "formats",
+    multiple=True,
+    type=click.Choice(options.format_ids("write")),
+    help="Format of the target; repeat it to write several, then TARGET is a folder. By default from the extension.",
+)
+@click.option(
+    "--preset",
+    type=click.Choice(["fast", "balanced", "best"]),
+    default="balanced",
+    show_default=True,
+    help="Speed, size and accuracy; every option below overrides it.",
+)
+@click.option(
+    "--sh-degree", type=options.DegreeType(), help="Highest SH band to keep; auto drops bands that are zero everywhere."
+)
+@click.option("--prune-opacity", type=click.FloatRange(0, 1), help="Drop splats of lower opacity; 0 prunes nothing.")
+@click.option("--order", type=click.Choice(["morton", "hilbert2d", "none"]), help="Order of splats; none keeps the source's.")
+@click.option("--source-coordinates", metavar="AXES", help=f"Axes of the source, {options.AXES}; by default what it says.")
+@click.option("--target-coordinates", metavar="AXES", help="Axes to convert to; by default nothing is converted.")
+@click.option(
+    "--recenter",
+    type=click.Choice(["auto", "on", "off"]),
+    help="Subtract an origin; auto where the target stores it and it gains precision.",
+)
+@click.option("--strict", is_flag=True, help="Refuse invalid splats and losses instead of dropping and counting them.")
+@_format_options
+@click.option("--frame-times", type=options.FrameTimesType(), help="Times of the source frames: a file or a list, in [0, 1].")
+@click.option("--time", "time_at", type=float, help="Take the moment at this normalized time of a sequence.")
+@click.option("--frame", type=click.IntRange(min=0), help="Take this stored frame of a sequence.")
+@click.option(
+    "--interpolation",
+    type=click.Choice(["linear", "nearest"]),
+    default="linear",
+    show_default=True,
+    help="Between frames, with --time.",
+)
+@click.option(
+    "--shn-order", type=click.Choice(["interleaved", "channel-major"]), help="SH order in .sog4d sources of other tools."
+)
+@click.option(
+    "--validate/--no-validate", default=True, help="Read the target back, hold it against its bounds, render and compare."
+)
+@click.option(
+    "--min-psnr", type=float, metavar="DB", help="Fail, and leave the target as it was, if the worst view is below this."
+)
+@click.option("--views", type=click.IntRange(min=0), default=2, show_default=True, help="Views to render when validating.")
+@click.option("--model", type=click.Choice(options.MODELS), help="Rendering model to validate with; by default the target's.")
+@options.jobs_option
+@click.option("--overwrite", is_flag=True, help="Replace a target that is there.")
+@options.json_option
+@click.option("--quiet", is_flag=True, help="Print errors only.")
+@options.progress_option
+@options.version_option
+@reports_errors
+def main(
+    sources: tuple[str, ...],
+    target: Path,
+    formats: tuple[str, ...],
+    *,
+    overwrite: bool,
+    as_json: bool,
+    quiet: bool,
+    progress: bool,
+    jobs: int | None,
+    **given: Any,
+) -> None:
+    """Convert SOURCE to TARGET, and prove that the target is right.
+
+    SOURCE is a file, or the frames of a sequence: several files, a folder or a quoted glob. The formats follow from
+    content and extension.
+
+    \b
+    gsplat-convert scene.ply scene.gspk
+    gsplat-convert scene.ply scene.sog4d --preset best --min-psnr 40
+    gsplat-convert scene.ply out/ --to spark --to sog4d --json
+    """  # noqa: D301 - \b keeps click from joining the lines
+    from gsplat_tools.convert import convert
+    from gsplat_tools.parallel import use_jobs
+
+    targets = _targets(sources, target, formats)
+    arguments = _arguments(given, [find_target(path, to) for path, to in targets])
+    for source in sources:
+        if not any(mark in source for mark in "*?[") and not Path(source).exists():
+            raise click.UsageError(f"source {source!r} does not exist")
+    reports = []
+    with use_jobs(jobs), output.showing_progress(progress and not quiet):
+        for (path, to), own in zip(targets, arguments, strict=True):
+            report = convert(sources, path, to=to, overwrite=overwrite, **own)
+            reports.append(report.to_json())
+            if not quiet:
+                for warning in report.warnings:
+                    click.echo(f"warning: {one_line(warning['message'])}", err=True)
+                if not as_json:
+                    click.echo(_summary(report.to_json()), err=True)
+    if as_json:
+        output.print_json(reports[0] if len(formats) <= 1 else {"conversions": reports})
+
+
+def _targets(sources: tuple[str, ...], target: Path, formats: tuple[str, ...]) -> list[tuple[Path, str | None]]:
+    """Return (path, format id) of every target; several formats go into a folder, named after the source."""
+    if len(formats) <= 1 and not target.is_dir():
+        return [(target, formats[0] if formats else None)]
+    if not formats:
+        raise click.UsageError(f"{target} is a folder; name a file in it or give --to")
+    if target.exists() and not target.is_dir():
+        raise click.UsageError(f"several formats need a folder, and {target} is a file")
+    target.mkdir(parents=True, exist_ok=True)
+    name = Path(sources[0]).name
+    stem = name[: -len(Path(name).suffix)] if Path(name).suffix else name
+    names = [f"{stem}{FORMATS[to].extensions[0]}" for to in formats]
+    # Two layouts share an extension: tell them apart by the format's name.
+    return [
+        (target / (one if names.count(one) == 1 else f"{stem}.{to}{FORMATS[to].extensions[0]}"), to)
+        for one, to in zip(names, formats, strict=True)
+    ]
+
+
+def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, Any]]:
+    """Return the arguments of `convert` for every target from the options that were given."""
+    from gsplat_tools.convert import Validation
+
+    own = {}
+    for flag, name, _ in FORMAT_OPTIONS:
+        value = given.get(f"own_{flag.strip('-').replace('-', '_')}")
+        if value is None:
+            continue
+        if not any(name in _own_fields(record) for record in records):
+            raise click.UsageError(f"{flag} does not apply to {' or '.join(record.id for record in records)}")
+        own[name] = value
+    validation = (
+        Validation(views=given["views"], model=given["model"], min_psnr=given["min_psnr"]) if given["validate"] else None
+    )
+    if given["min_psnr"] is not None and (validation is None or given["views"] == 0):
+        raise click.UsageError("--min-psnr needs --validate and at least one view")
+    general = {option.name: given[option.name] for option in fields(SaveChoices) if given[option.name] not in (None, False)}
+    shared = {
+        "preset": given["preset"],
+        "validation": validation,
+        "time_at": given["time_at"],
+        "frame": given["frame"],
+        "interpolation": given["interpolation"],
+        "read_options": {"shn_order": given["shn_order"]} if given["shn_order"] else {},
+        **general,
+        **({"frame_times": given["frame_times"]} if given["frame_times"] else {}),
+    }
+    return [{**shared, **{name: value for name, value in own.items() if name in _own_fields(record)}} for record in records]
+
+
+def _summary(report: dict[str, Any]) -> str:
+    """Return what was done in a few lines."""
+    target, seconds = report["target"], report["seconds"]
+    splats = report["splats"]
+    lines = [
+        f"{report['source']} -> {target['path']} ({target['format']})",
+        f"  {output.count(splats)} splats, SH degree {report['sh_degree']}"
+        + (f", {report['frames']} frames" if report["frames"] > 1 else "")
+        + f", {output.count(target['bytes'])} bytes"
+        + (f" ({target['bytes'] / splats / report['frames']:.2f} a splat)" if splats else "")
+        + f", {sum(seconds.values()):.2f} s ("
+        + ", ".join(f"{name} {value:.2f}" for name, value in seconds.items())
+        + ")",
+    ]
+    if report["dropped"]:
+        lines.append("  dropped: " + ", ".join(f"{cause} {count}" for cause, count in report["dropped"].items()))
+    validation = report["validation"]
+    if validation is None:
+        return "\n".join([*lines, "  not validated"])
+    rows: list[tuple[str, ...]] = [
+        (name, output.number(e["max"]), output.number(e["rms"]), output.number(e["bound"]))
+        for name, e in validation["attributes"].items()
+    ]
+    if rows:
+        errors = output.table(rows, ("  error of", "max", "rms", "bound"))
+        lines += [line if line.startswith("  ") else f"  {line}" for line in errors.splitlines()]
+    if validation["psnr_min"] is not None:
+        lines.append(
+            f"  rendered ({validation['model']}): PSNR min {validation['psnr_min']:.2f} dB, "
+            f"mean {validation['psnr_mean']:.2f} dB, SSIM {validation['ssim_mean']:.5f}, largest difference {validation['max_abs']:.4f}"
+        )
+    elif validation.get("identical"):
+        lines.append(f"  rendered ({validation['model']}): identical")
+    lines.append("  validation passed")
+    return "\n".join(lines)

@@ -1,0 +1,191 @@
+"""File to header report, cloud to statistics report; all of gsplat-inspect but its printing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.attributes import activations
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.constants import VISIBLE_OPACITY
+from gsplat_tools.formats.base import FileInfo, Format
+from gsplat_tools.formats.loading import inspect_file, open_scene
+from gsplat_tools.ops.recentering import position_step
+from gsplat_tools.sequence import GaussianSequence
+
+PERCENTILES = (0.1, 1, 5, 25, 50, 75, 95, 99, 99.9)
+HISTOGRAM_BINS = 32
+NEEDLE_ASPECT = 30.0
+"""Longest over second longest axis; beyond it 8-bit rotation codes double the visible width (docs/conventions.md)."""
+
+
+def info(path: str | Path) -> dict[str, Any]:
+    """Return the header facts of a file, with the names of `gsplat-inspect info --json`.
+
+    Raises
+    ------
+    FormatError
+        The bytes are at fault.
+    """
+    record, facts = inspect_file(path)
+    return describe(Path(path), record, facts)
+
+
+def describe(path: Path, record: Format, facts: FileInfo) -> dict[str, Any]:
+    """Return header facts as JSON values."""
+    values = asdict(facts)
+    for name in ("bounds", "motion_bounds"):
+        box = values[name]
+        values[name] = None if box is None else {"min": list(map(float, box[0])), "max": list(map(float, box[1]))}
+    values["origin"] = list(values["origin"])
+    return {"format": record.id, "version": values.pop("version"), "bytes": path.stat().st_size, **values}
+
+
+@dataclass(frozen=True, slots=True)
+class Hint:
+    """Something that a user may want to know about a scene."""
+
+    code: str
+    message: str
+
+
+def statistics(path: str | Path, *, frame: int = 0) -> dict[str, Any]:
+    """Return statistics of every attribute as stored, invalid splats included.
+
+    Parameters
+    ----------
+    path
+        File to read whole.
+    frame
+        Frame of a sequence.
+
+    Raises
+    ------
+    FormatError
+        The bytes are at fault.
+    """
+    path = Path(path)
+    with open_scene(path, in_chunks=False) as scene:
+        cloud = scene.frame(frame) if isinstance(scene, GaussianSequence) else scene
+        assert isinstance(cloud, GaussianCloud)
+        return {
+            "file": str(path),
+            "splats": len(cloud),
+            "sh_degree": cloud.sh_degree,
+            "attributes": {name: describe_values(values) for name, values in _columns(cloud).items()},
+            "hints": [asdict(hint) for hint in hints(cloud)],
+        }
+
+
+def _columns(cloud: GaussianCloud) -> Mapping[str, NDArray[Any]]:
+    """Return every attribute, and those users think in: opacity after the sigmoid, aspect ratio."""
+    columns: dict[str, NDArray[Any]] = dict(cloud.arrays())
+    if cloud.sh_degree == 0:
+        del columns["shN"]
+    columns["opacities"] = activations.sigmoid(cloud.opacity_logits)
+    columns["quat_norms"] = np.linalg.norm(cloud.quats, axis=1)
+    columns["aspect"] = _aspects(cloud)
+    columns.update({name: values for name, values in cloud.extra.items() if np.issubdtype(values.dtype, np.number)})
+    return columns
+
+
+def _aspects(cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Return longest over second longest axis of every splat."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        ordered = np.sort(cloud.log_scales, axis=1)
+        return np.asarray(np.exp(ordered[:, 2] - ordered[:, 1]), np.float32)
+
+
+def describe_values(values: NDArray[Any]) -> dict[str, Any]:
+    """Return min, max, mean, std, percentiles and histogram of the finite values, and how many are not finite."""
+    flat = np.asarray(values).reshape(-1)
+    is_float = np.issubdtype(flat.dtype, np.floating)
+    num_nan = int(np.count_nonzero(np.isnan(flat))) if is_float else 0
+    num_inf = int(np.count_nonzero(np.isinf(flat))) if is_float else 0
+    finite = (flat[np.isfinite(flat)] if num_nan or num_inf else flat).astype(np.float64)
+    if finite.size == 0:
+        empty = dict.fromkeys(("min", "max", "mean", "std"))
+        return {**empty, "percentiles": {}, "nan": num_nan, "inf": num_inf, "histogram": {"edges": [], "counts": []}}
+    counts, edges = np.histogram(finite, bins=HISTOGRAM_BINS)
+    return {
+        "min": float(finite.min()),
+        "max": float(finite.max()),
+        "mean": float(finite.mean()),
+        "std": float(finite.std()),
+        "percentiles": {f"{p:g}": float(v) for p, v in zip(PERCENTILES, np.percentile(finite, PERCENTILES), strict=True)},
+        "nan": num_nan,
+        "inf": num_inf,
+        "histogram": {"edges": edges.tolist(), "counts": counts.tolist()},
+    }
+
+
+def hints(cloud: GaussianCloud) -> list[Hint]:
+    """Return what looks odd or costly about a scene."""
+    if len(cloud) == 0:
+        return [Hint("empty", "the file holds no splats")]
+    found = []
+    finite_scales = cloud.log_scales[np.isfinite(cloud.log_scales)]
+    if finite_scales.size and finite_scales.min() >= 0:
+        found.append(
+            Hint("scales-look-linear", "no log scale is negative: the scales may be linear; 3DGS stores their logarithm")
+        )
+    finite_logits = cloud.opacity_logits[np.isfinite(cloud.opacity_logits)]
+    if finite_logits.size and finite_logits.min() >= 0 and finite_logits.max() <= 1:
+        found.append(
+            Hint("opacities-look-activated", "every opacity lies in 0..1: it may be after the sigmoid; 3DGS stores logits")
+        )
+    with np.errstate(invalid="ignore"):
+        needles = int(np.count_nonzero(_aspects(cloud) > NEEDLE_ASPECT))
+    if needles:
+        found.append(
+            Hint("needles", f"{needles} splats are more than {NEEDLE_ASPECT:g} times as long as wide: use --rotation best")
+        )
+    hidden = int(np.count_nonzero(activations.sigmoid(cloud.opacity_logits) < VISIBLE_OPACITY))
+    if hidden:
+        found.append(Hint("invisible", f"{hidden} splats have an opacity below 1/255: --prune-opacity 0.0039 drops them"))
+    if cloud.sh_degree and not cloud.shN.any():
+        found.append(Hint("sh-all-zero", f"SH bands 1 to {cloud.sh_degree} are zero everywhere: --sh-degree auto drops them"))
+    found += _float16_hint(cloud) + _overdraw_hint(cloud)
+    return found
+
+
+def _float16_hint(cloud: GaussianCloud) -> list[Hint]:
+    """Report splats whose float16 position step is above half their own size (docs/conventions.md)."""
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        size = np.exp(cloud.log_scales.max(axis=1).astype(np.float64))
+        reach = np.abs(cloud.means).max(axis=1).astype(np.float64)
+        reach = np.where(np.isfinite(reach) & (reach > 0), reach, 1e-8)
+        half_step = np.exp2(np.floor(np.log2(reach)) - 11)
+        coarse = int(np.count_nonzero(half_step > 0.5 * size))
+    if not coarse:
+        return []
+    step = position_step(float(np.nanmax(np.where(np.isfinite(cloud.means), np.abs(cloud.means), 0))), "f16")
+    return [
+        Hint(
+            "float16-step",
+            f"float16 positions move {coarse} of {len(cloud)} splats by over half their size (step up to {step:g}): recenter",
+        )
+    ]
+
+
+def _overdraw_hint(cloud: GaussianCloud) -> list[Hint]:
+    """Report few large splats that cover most of the drawn area."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        ordered = np.sort(cloud.log_scales.astype(np.float64), axis=1)
+        areas = np.exp(ordered[:, 2] + ordered[:, 1])
+    areas = np.sort(np.where(np.isfinite(areas), areas, 0.0))[::-1]
+    total = areas.sum()
+    top = max(1, len(areas) // 100)
+    share = float(areas[:top].sum() / total) if total > 0 else 0.0
+    if len(cloud) < 1000 or share < 0.9:
+        return []
+    return [
+        Hint(
+            "overdraw", f"the largest 1 % of the splats have {100 * share:.0f} % of the total area: they dominate drawing time"
+        )
+    ]
