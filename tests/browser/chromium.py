@@ -49,11 +49,11 @@ FLAGS = (
 
 
 class BrowserError(RuntimeError):
-    """The page, a job in it or Chromium itself failed; `name` is the JavaScript class of the error, if there was one."""
+    """The page, a job in it or Chromium itself failed; `error` is the JavaScript error's name, message, field and offset."""
 
-    def __init__(self, message: str, *, name: str = "") -> None:
+    def __init__(self, message: str, *, error: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
-        self.name = name
+        self.error = dict(error or {})
 
 
 def executable() -> str | None:
@@ -123,7 +123,7 @@ class Chromium:
         if "error" in answer:
             error = answer["error"]
             where = f"{name} failed in the browser" if path != "/broken" else "the page did not load"
-            raise BrowserError(f"{where}: {error['name']}: {error['message']}\n{error['stack']}", name=error["name"])
+            raise BrowserError(f"{where}: {error['name']}: {error['message']}\n{error['stack']}", error=error)
         return answer["report"], rest
 
     def close(self) -> None:
@@ -189,6 +189,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     server: _Server
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+    wbufsize = -1  # head and body in one packet
 
     def do_GET(self) -> None:
         browser = self.server.browser

@@ -1,6 +1,8 @@
 // What the page can be asked to do: each exported function takes (settings, blobs) and returns {report, bytes}.
-import { PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+import * as spark from "@sparkjsdev/spark";
+import { decompress } from "fzstd";
 import * as THREE from "three";
+import { readGspk as read, toSplatMesh } from "/web/gspk.mjs";
 
 let renderer;
 
@@ -10,13 +12,32 @@ export async function drawPacked(settings, blobs) {
   for (const band of ["sh1", "sh2", "sh3"]) {
     if (blobs[band]) extra[band] = new Uint32Array(blobs[band]);
   }
-  const splats = new PackedSplats({
+  const splats = new spark.PackedSplats({
     packedArray: new Uint32Array(blobs.packed),
     numSplats: settings.numSplats,
     extra,
     ...(settings.splatEncoding ? { splatEncoding: settings.splatEncoding } : {}),
   });
-  return draw(splats, settings);
+  // SplatMesh overwrites the encoding of the PackedSplats it is given, with the defaults if it is told nothing.
+  return draw(new spark.SplatMesh({ packedSplats: splats, splatEncoding: splats.splatEncoding }), settings);
+}
+
+/** Draw a .gspk file as a page would: read by web/gspk.mjs, drawn by Spark. */
+export async function drawGspk(settings, { file }) {
+  return draw(toSplatMesh(spark, await read(file, { decompress })), settings);
+}
+
+/** What web/gspk.mjs makes of a file; `settings.array` names the array whose bytes come back, as a path such as "extra.sh1". */
+export async function readGspk({ array, withoutDecompressor = false, options = {} }, { file }) {
+  const pack = await read(file, withoutDecompressor ? options : { decompress, ...options });
+  const find = (path) => path.split(".").reduce((value, key) => value?.[key], pack);
+  const found = array ? find(array) : new Uint8Array();
+  if (!ArrayBuffer.isView(found)) throw new Error(`the pack has no array ${array}`);
+  const describe = (value) => (ArrayBuffer.isView(value) ? { type: value.constructor.name, length: value.length, isView: value.buffer === file } : value);
+  const report = Object.fromEntries(Object.entries(pack).map(([key, value]) => [key, describe(value)]));
+  report.extra = Object.fromEntries(Object.entries(pack.extra ?? {}).map(([key, value]) => [key, describe(value)]));
+  if (pack.motion) report.motion = Object.fromEntries(Object.entries(pack.motion).map(([key, value]) => [key, describe(value)]));
+  return { report, bytes: new Uint8Array(found.buffer, found.byteOffset, found.byteLength) };
 }
 
 /** What is drawing: versions and the GL behind the pixels. */
@@ -35,50 +56,49 @@ export async function describeRenderer() {
 
 /** The defaults of SparkRenderer, as it reports them itself. */
 export async function sparkDefaults() {
-  const spark = new SparkRenderer({ renderer: getRenderer() });
+  const sparkRenderer = new spark.SparkRenderer({ renderer: getRenderer() });
   const report = {};
-  for (const [name, value] of Object.entries(spark)) {
+  for (const [name, value] of Object.entries(sparkRenderer)) {
     if (["number", "boolean"].includes(typeof value)) report[name] = value;
   }
-  report.premultipliedAlpha = spark.premultipliedAlpha;
-  spark.dispose();
+  report.premultipliedAlpha = sparkRenderer.premultipliedAlpha;
+  sparkRenderer.dispose();
   return { report };
 }
 
-async function draw(splats, { camera: given, options, background }) {
+async function draw(mesh, { camera: given, options, background }) {
   const canvas = getRenderer();
   canvas.setSize(given.width, given.height, false);
   canvas.setClearColor(new THREE.Color().setRGB(...background.slice(0, 3), THREE.SRGBColorSpace), background[3]);
 
   // autoUpdate off: the order is brought up to date here, once, before anything is drawn, and not while drawing.
-  const spark = new SparkRenderer({ renderer: canvas, enableLod: false, ...options, autoUpdate: false });
-  // SplatMesh overwrites the encoding of the PackedSplats it is given, with the defaults if it is told nothing.
-  const mesh = new SplatMesh({ packedSplats: splats, splatEncoding: splats.splatEncoding });
+  const sparkRenderer = new spark.SparkRenderer({ renderer: canvas, enableLod: false, ...options, autoUpdate: false });
   const scene = new THREE.Scene();
-  scene.add(spark, mesh);
+  scene.add(sparkRenderer, mesh);
   try {
     await mesh.initialized;
     const camera = toThreeCamera(given);
     scene.updateMatrixWorld(true);
-    await spark.update({ scene, camera });
-    await sorted(spark);
+    await sparkRenderer.update({ scene, camera });
+    await sorted(sparkRenderer);
     canvas.render(scene, camera);
     const gl = canvas.getContext();
     const bytes = new Uint8Array(4 * given.width * given.height);
     gl.readPixels(0, 0, given.width, given.height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     const error = gl.getError();
     if (error !== gl.NO_ERROR) throw new Error(`WebGL error ${error}`);
-    return { report: { numSplats: splats.numSplats, numSh: splats.getNumSh(), activeSplats: spark.activeSplats }, bytes };
+    const { numSplats, splatEncoding } = mesh.packedSplats;
+    return { report: { numSplats, splatEncoding, numSh: mesh.packedSplats.getNumSh(), activeSplats: sparkRenderer.activeSplats }, bytes };
   } finally {
-    scene.remove(spark, mesh);
+    scene.remove(sparkRenderer, mesh);
     mesh.dispose();
-    spark.dispose();
+    sparkRenderer.dispose();
   }
 }
 
 /** Wait until Spark's worker has sorted the splats for the camera of the last update. */
-async function sorted(spark) {
-  while (spark.sorting || spark.sortDirty || spark.display !== spark.current) {
+async function sorted(sparkRenderer) {
+  while (sparkRenderer.sorting || sparkRenderer.sortDirty || sparkRenderer.display !== sparkRenderer.current) {
     await new Promise((resolve) => setTimeout(resolve, 1));
   }
 }
