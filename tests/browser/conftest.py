@@ -15,10 +15,15 @@ REQUIRED = "GSPLAT_TOOLS_REQUIRE_BROWSER"
 @pytest.fixture(scope="session")
 def browser() -> Iterator[chromium.Chromium]:
     """Headless Chromium with the page of this folder."""
-    reason = chromium.missing()
-    if reason is not None:
-        if os.environ.get(REQUIRED) == "1":
-            pytest.fail(f"{REQUIRED}=1, but {reason}")
-        pytest.skip(reason)
+    stop_where_missing(chromium.missing())
     with chromium.Chromium() as running:
         yield running
+
+
+def stop_where_missing(reason: str | None) -> None:
+    """Skip the test where something is not installed; fail it where the environment says that it must be."""
+    if reason is None:
+        return
+    if os.environ.get(REQUIRED) == "1":
+        pytest.fail(f"{REQUIRED}=1, but {reason}")
+    pytest.skip(reason)
