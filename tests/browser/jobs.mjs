@@ -2,7 +2,7 @@
 import * as spark from "@sparkjsdev/spark";
 import { decompress } from "fzstd";
 import * as THREE from "three";
-import { readGspk as read, toSplatMesh } from "/web/gspk.mjs";
+import { paddedCount, readGspk as read, toSplatMesh } from "/web/gspk.mjs";
 
 let renderer;
 
@@ -38,6 +38,11 @@ export async function readGspk({ array, withoutDecompressor = false, options = {
   report.extra = Object.fromEntries(Object.entries(pack.extra ?? {}).map(([key, value]) => [key, describe(value)]));
   if (pack.motion) report.motion = Object.fromEntries(Object.entries(pack.motion).map(([key, value]) => [key, describe(value)]));
   return { report, bytes: new Uint8Array(found.buffer, found.byteOffset, found.byteLength) };
+}
+
+/** How many splats web/gspk.mjs makes room for. */
+export async function padCounts({ counts }) {
+  return { report: { padded: counts.map(paddedCount) } };
 }
 
 /** What is drawing: versions and the GL behind the pixels. */

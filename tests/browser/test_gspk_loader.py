@@ -46,6 +46,15 @@ def test_read_gspk__gives_spark_every_word_padded_to_whole_rows(browser, codec, 
     assert report["splatEncoding"] == DEFAULTS
 
 
+def test_padded_count__fills_whole_rows_and_beyond_one_layer_whole_layers(browser):
+    row, layer = 2048, 2048 * 2048
+
+    report, _ = browser.call("padCounts", {"counts": [0, 1, row, row + 1, layer - 1, layer, layer + 1, 3 * layer]})
+
+    # Spark 2.2.0 fails to upload 4,194,305 splats that fill rows only (WebGL error 1282).
+    assert report["padded"] == [row, row, row, 2 * row, layer, layer, 2 * layer, 3 * layer]
+
+
 def test_read_gspk__passes_the_encoding_on_without_the_band_that_spark_has_not(browser):
     words = make_words(np.random.default_rng(0), 5, 0, scale_bytes=(60, 120))
 
