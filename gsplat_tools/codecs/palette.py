@@ -129,9 +129,7 @@ def _first_centroids(points: Float32, weights: Float32, size: int, seed: int) ->
     return points[chosen]
 
 
-def _means_of_clusters(
-    points: Float32, weights: Float32, labels: Labels, distances: Float32, centroids: Float32
-) -> Float32:
+def _means_of_clusters(points: Float32, weights: Float32, labels: Labels, distances: Float32, centroids: Float32) -> Float32:
     """Return the weighted means; empty clusters move to the points that err most."""
     from gsplat_tools.kernels.nearest import add_to_clusters
 

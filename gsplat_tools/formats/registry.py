@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsplat_tools.errors import CapabilityError, UnknownFormatError
-from gsplat_tools.formats import ply
+from gsplat_tools.formats import ply, sog4d
 from gsplat_tools.formats.base import SNIFF_BYTES, Format
 
-_MODULES: tuple[Format, ...] = (ply.FORMAT,)
+_MODULES: tuple[Format, ...] = (ply.FORMAT, sog4d.FORMAT)
 
 FORMATS: dict[str, Format] = {record.id: record for record in _MODULES}
 

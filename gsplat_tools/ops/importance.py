@@ -39,4 +39,5 @@ def importance(cloud: GaussianCloud) -> NDArray[np.float32]:
     if not np.isfinite(top):
         top = log_weights[np.isfinite(log_weights)].max(initial=0.0)
     floor = -np.log(WEIGHT_RANGE)
-    return np.exp(np.clip(log_weights - top, floor, 0.0)).astype(np.float32)
+    weights: NDArray[np.float32] = np.exp(np.clip(log_weights - top, floor, 0.0)).astype(np.float32)
+    return weights

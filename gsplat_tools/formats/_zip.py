@@ -1,0 +1,178 @@
+"""ZIP archives: read after checks of every claim, written so that the same entries give the same bytes."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import BinaryIO, Literal
+
+from gsplat_tools.errors import CorruptDataError, LimitExceededError
+from gsplat_tools.formats._issues import Issue, Rule, raise_errors
+from gsplat_tools.formats._stream import MAX_EXPANSION
+
+Compression = Literal["stored", "deflated"]
+
+MAX_ENTRIES = 1 << 22
+"""More entries than any bundle of 100,000 frames needs."""
+
+_FIXED_TIME = (1980, 1, 1, 0, 0, 0)
+_SLACK_BYTES = 1 << 16
+
+RULES: dict[str, Rule] = {
+    "zip-invalid": Rule(severity="error", meaning="The file is a ZIP archive that can be opened."),
+    "zip-too-many-entries": Rule(
+        severity="error", meaning=f"The archive has at most {MAX_ENTRIES} entries.", error=LimitExceededError
+    ),
+    "zip-bad-name": Rule(severity="warning", meaning="Entry names are relative, with / between parts, without . or .."),
+    "zip-duplicate": Rule(severity="warning", meaning="Entry names are unique; of equal names the last entry counts."),
+    "zip-encrypted": Rule(severity="error", meaning="Entries are not encrypted."),
+    "zip-method": Rule(severity="error", meaning="Entries are stored or deflated."),
+    "zip-ratio": Rule(
+        severity="error",
+        meaning=f"No entry claims more than {MAX_EXPANSION} times its compressed size.",
+        error=LimitExceededError,
+    ),
+    "zip-overlap": Rule(severity="error", meaning="No two entries share bytes of the archive."),
+    "zip-entry-corrupt": Rule(severity="error", meaning="Every entry that is read decompresses and matches its CRC."),
+}
+
+
+class ZipReader:
+    """A ZIP archive whose directory has been checked.
+
+    Parameters
+    ----------
+    stream
+        Can seek; stays open as long as entries are read. Reads from several threads are safe.
+
+    Raises
+    ------
+    CorruptDataError, LimitExceededError
+        The archive breaks a rule of `RULES`.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        stream.seek(0)
+        try:
+            self._archive = zipfile.ZipFile(stream)
+        except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError, OverflowError) as error:
+            raise CorruptDataError(f"expected a ZIP archive, found none that can be opened ({error})") from error
+        self.issues = raise_errors(check_directory(self._archive.infolist()), RULES)
+        self._last = {info.filename: info for info in self._archive.infolist()}
+
+    @property
+    def names(self) -> list[str]:
+        """Distinct entry names, in the order of the archive."""
+        return list(self._last)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._last
+
+    def size(self, name: str) -> int:
+        """Return the length of an entry as its directory record claims."""
+        return self._last[name].file_size
+
+    def stored_size(self, name: str) -> int:
+        """Return the bytes that an entry takes in the archive."""
+        return self._last[name].compress_size
+
+    def method(self, name: str) -> str:
+        """Return how an entry is compressed."""
+        return "stored" if self._last[name].compress_type == zipfile.ZIP_STORED else "deflated"
+
+    def read(self, name: str, *, frame: int | None = None) -> bytes:
+        """Return the bytes of the last entry of that name.
+
+        Raises
+        ------
+        CorruptDataError
+            There is no such entry, or it does not decompress to what its record says.
+        """
+        info = self._last.get(name)
+        if info is None:
+            raise CorruptDataError("the archive has no such entry", field=name, frame=frame)
+        try:
+            return self._archive.read(info)
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError, RuntimeError) as error:
+            raise CorruptDataError(f"the entry does not decompress ({error})", field=name, frame=frame) from error
+
+
+def check_directory(entries: list[zipfile.ZipInfo]) -> Iterator[Issue]:
+    """Yield what is wrong with the directory of an archive."""
+    if len(entries) > MAX_ENTRIES:
+        yield Issue(
+            code="zip-too-many-entries",
+            message=f"expected at most {MAX_ENTRIES} entries, found {len(entries)}",
+            value=len(entries),
+        )
+        return
+    seen: set[str] = set()
+    for info in entries:
+        name = info.filename
+        if not is_relative_name(name.removesuffix("/")):
+            yield Issue(code="zip-bad-name", message=f"expected a relative name, found {name!r}; it is ignored", field=name)
+        if name in seen:
+            yield Issue(code="zip-duplicate", message="the name occurs again; the last entry counts", field=name)
+        seen.add(name)
+        if info.flag_bits & 0x41:
+            yield Issue(code="zip-encrypted", message="the entry is encrypted; decrypt the archive first", field=name)
+        if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            yield Issue(
+                code="zip-method",
+                message=f"expected a stored or deflated entry, found method {info.compress_type}",
+                field=name,
+                value=info.compress_type,
+            )
+        if info.file_size > info.compress_size * MAX_EXPANSION + _SLACK_BYTES:
+            yield Issue(
+                code="zip-ratio",
+                message=f"the entry claims {info.file_size} bytes from {info.compress_size}, more than {MAX_EXPANSION} times",
+                field=name,
+                value=info.file_size,
+            )
+    ordered = sorted(entries, key=lambda info: (info.header_offset, info.compress_size))
+    for before, after in pairwise(ordered):
+        if before.header_offset + 30 + before.compress_size > after.header_offset:
+            yield Issue(
+                code="zip-overlap",
+                message=f"the entry shares bytes with {after.filename!r}",
+                field=before.filename,
+                offset=before.header_offset,
+            )
+
+
+def is_relative_name(name: str) -> bool:
+    """Whether a path is relative, with / as its only separator and no empty, . or .. part."""
+    return bool(name) and not any(c in name for c in ":\\\0") and not {"", ".", ".."} & set(name.split("/"))
+
+
+class ZipWriter:
+    """Writes entries one after another with fixed times and modes, so that equal entries give equal bytes.
+
+    Parameters
+    ----------
+    stream
+        Open for writing from its current position.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._archive = zipfile.ZipFile(stream, "w", allowZip64=True)
+
+    def add(self, name: str, data: bytes, compression: Compression) -> None:
+        """Append one entry."""
+        info = zipfile.ZipInfo(name, _FIXED_TIME)
+        info.create_system = 3  # else it differs by operating system
+        info.external_attr = 0o644 << 16
+        info.compress_type = zipfile.ZIP_STORED if compression == "stored" else zipfile.ZIP_DEFLATED
+        self._archive.writestr(info, data, compresslevel=9)
+
+    def close(self) -> None:
+        """Write the directory."""
+        self._archive.close()
+
+
+def starts_like_zip(head: bytes) -> bool:
+    """Whether a file begins with a local entry or an empty directory of a ZIP archive."""
+    return head[:4] in {b"PK\x03\x04", b"PK\x05\x06"}

@@ -1,0 +1,131 @@
+"""The .sog4d keyframe sequence bundle of the raiscui/gsplat-unity fork: a ZIP of meta.json, images and palettes.
+
+meta.json names the streams; each frame is a set of lossless RGBA8 WebP images whose pixel i, row by row, is splat i:
+position_hi and position_lo (16-bit codes in the frame's range), scale_indices (into a codebook of linear triples),
+rotation (bytes w x y z), sh0 (three codebook indices, opacity), and labels into SH palettes, as images or as changes.
+The table of fields and rules is docs/formats/sog4d.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.errors import CloudError
+from gsplat_tools.formats._webp import Image
+from gsplat_tools.formats._zip import ZipReader
+from gsplat_tools.formats.base import Bounds, FileInfo, Format
+from gsplat_tools.formats.sog4d.bundle import Bundle, read_meta
+from gsplat_tools.formats.sog4d.decode import read
+from gsplat_tools.formats.sog4d.encode import write
+from gsplat_tools.formats.sog4d.options import Sog4dOptions, Sog4dReadOptions
+from gsplat_tools.formats.sog4d.rules import RULES
+
+__all__ = ["FORMAT", "RULES", "Sog4dOptions", "Sog4dReadOptions", "inspect", "matches", "planes", "read", "write"]
+
+
+def planes(path: str | Path, frame: int) -> dict[str, Image]:
+    """Return the raw images of one frame by stream name.
+
+    Parameters
+    ----------
+    path
+        A .sog4d file.
+    frame
+        Index of the frame.
+
+    Returns
+    -------
+    dict[str, Image]
+        (height, width, 4) RGBA bytes under "position_hi", "position_lo", "scale_indices", "rotation", "sh0", and
+        "shN_labels" (version 1) or "sh1_labels" to "sh3_labels" (version 2); labels of delta segments are expanded.
+
+    Raises
+    ------
+    FormatError
+        The bundle breaks a rule of docs/formats/sog4d.md.
+    CloudError
+        There is no such frame.
+    """
+    with Path(path).open("rb") as stream:
+        bundle = Bundle(stream)
+        if not 0 <= frame < bundle.meta.frame_count:
+            raise CloudError(f"expected a frame in 0..{bundle.meta.frame_count - 1}, found {frame}", path=path, frame=frame)
+        return bundle.planes(frame)
+
+
+def matches(head: bytes) -> bool:
+    """Whether a file begins like a bundle whose first entry is an image of a frame; others are known by extension."""
+    return head[:4] == b"PK\x03\x04" and head[30:37] == b"frames/"
+
+
+def inspect(stream: BinaryIO) -> FileInfo:
+    """Return what meta.json says; no image is decoded.
+
+    Raises
+    ------
+    FormatError
+        The bundle breaks a rule of the archive or of meta.json.
+    """
+    archive = ZipReader(stream)
+    meta, _ = read_meta(archive)
+    palettes = {
+        palette.name: {
+            "entries": palette.count,
+            "centroids": palette.centroids_type,
+            "labels": "full" if palette.labels_path is not None else "delta-v1",
+            "segments": len(palette.segments),
+        }
+        for palette in meta.palettes
+    }
+    low, high = meta.range_min.min(axis=0), meta.range_max.max(axis=0)
+    return FileInfo(
+        version=str(meta.version),
+        splats=meta.splat_count,
+        sh_degree=meta.bands,
+        frames=meta.frame_count,
+        bounds=(low.astype(np.float64).tolist(), high.astype(np.float64).tolist()),
+        encoding={
+            "layout": [meta.width, meta.height],
+            "time_mapping": "uniform" if meta.frame_times is None else "explicit",
+            "scale_codebook": len(meta.scale_codebook),
+            "palettes": palettes,
+            "generator": meta.generator,
+            "entries": len(archive.names),
+            "stored_bytes": sum(archive.stored_size(name) for name in archive.names),
+        },
+    )
+
+
+def _bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
+    from gsplat_tools.formats.sog4d.bounds import bounds
+
+    return bounds(source, stream, frame)
+
+
+FORMAT = Format(
+    id="sog4d",
+    title=".sog4d sequence bundle",
+    extensions=(".sog4d",),
+    spec="docs/formats/sog4d.md",
+    max_sh_degree=3,
+    matches=matches,
+    inspect=inspect,
+    read=read,
+    write=write,
+    bounds=_bounds,
+    holds_sequences=True,
+    order="morton",
+    position_type="fixed",
+    read_options=Sog4dReadOptions,
+    write_options=Sog4dOptions,
+    presets={
+        "fast": {"webp_effort": 1},
+        "balanced": {},
+        "best": {"webp_effort": 8},
+    },
+    model=("unity", "fork-4d"),
+)

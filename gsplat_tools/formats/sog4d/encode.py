@@ -1,0 +1,374 @@
+"""Cloud or sequence to bundle. Encoding a frame is a pure function of the frame, what is shared, and the labels before."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
+from gsplat_tools.formats import _webp
+from gsplat_tools.formats._webp import MAX_SIDE, Image
+from gsplat_tools.formats._zip import Compression, ZipWriter
+from gsplat_tools.formats.sog4d import labels as label_files
+from gsplat_tools.formats.sog4d.codebooks import (
+    Palette,
+    Shared,
+    check_finite,
+    draw_sample,
+    fit_shared,
+    scale_coordinates,
+    turned,
+)
+from gsplat_tools.formats.sog4d.decode import GENERATOR
+from gsplat_tools.formats.sog4d.labels import Labels
+from gsplat_tools.formats.sog4d.meta import FRAME_TOKEN, Meta, PaletteMeta, Segment, frame_path, meta_text
+from gsplat_tools.formats.sog4d.options import Sog4dOptions
+from gsplat_tools.formats.sog4d.textures import index_image, rgba_image
+from gsplat_tools.parallel import map_ordered
+from gsplat_tools.progress import stage
+from gsplat_tools.sequence import GaussianSequence
+
+Float32 = NDArray[np.float32]
+
+PATHS = {
+    name: f"frames/{FRAME_TOKEN}/{name}.webp" for name in ("position_hi", "position_lo", "scale_indices", "rotation", "sh0")
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FramePlanes:
+    """One frame as images and labels, before compression.
+
+    Parameters
+    ----------
+    images
+        RGBA by stream name, labels included.
+    range_min, range_max
+        (3,) range of the positions.
+    labels
+        Scale indices under "scale", SH labels under the palette's name; the next frame of the segment starts from them.
+    clipped
+        Values that the sh0 codebook cannot reach, by what happened to them.
+    """
+
+    images: dict[str, Image]
+    range_min: Float32
+    range_max: Float32
+    labels: dict[str, Labels]
+    clipped: dict[str, int] = field(default_factory=dict)
+
+
+def encode_frame(cloud: GaussianCloud, shared: Shared, previous: dict[str, Labels] | None = None) -> FramePlanes:
+    """Quantize one frame.
+
+    Parameters
+    ----------
+    cloud
+        The frame, splats in the order of the bundle.
+    shared
+        Codebooks, palettes and options of the bundle.
+    previous
+        Labels of the frame before in the same segment; None starts a segment.
+    """
+    from gsplat_tools.codecs import quaternion_u8
+    from gsplat_tools.codecs.scalar_codebook import nearest_entry
+
+    width, height = shared.width, shared.height
+    low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
+    codes = position_codes(cloud.means, low, high)
+    quats, log_scales = turned(cloud, shared.rotation_frames)
+    labels: dict[str, Labels] = {}
+    labels["scale"] = choose_labels(
+        scale_coordinates(log_scales), shared.scale_points, shared.scale_error, shared.options.keep_tolerance,
+        None if previous is None else previous["scale"],
+    )  # fmt: skip
+    mode: quaternion_u8.Mode = "reference" if shared.options.rotation == "reference" else "best"
+    colors = np.empty((len(cloud), 4), np.uint8)
+    colors[:, :3] = nearest_entry(cloud.sh0, shared.sh0_codebook)
+    colors[:, 3] = opacity_bytes(cloud.opacity_logits)
+    images = {
+        "position_hi": rgba_image((codes >> 8).astype(np.uint8), width, height),
+        "position_lo": rgba_image((codes & 0xFF).astype(np.uint8), width, height),
+        "scale_indices": index_image(labels["scale"], width, height),
+        "rotation": rgba_image(quaternion_u8.encode(quats, mode=mode), width, height),
+        "sh0": rgba_image(colors, width, height),
+    }
+    for palette in shared.palettes:
+        labels[palette.name] = choose_labels(
+            palette.rows(cloud), palette.centroids, palette.error, shared.options.keep_tolerance,
+            None if previous is None else previous[palette.name],
+        )  # fmt: skip
+        images[f"{palette.name}_labels"] = index_image(labels[palette.name], width, height)
+    outside = (cloud.sh0 < shared.sh0_codebook[0]) | (cloud.sh0 > shared.sh0_codebook[-1])
+    clipped = {"sh0": int(outside.any(axis=1).sum())} if outside.any() else {}
+    return FramePlanes(images, low, high, labels, clipped)
+
+
+def position_codes(means: Float32, low: Float32, high: Float32) -> NDArray[np.uint16]:
+    """Return round((x - min) / (max - min) 65535), 0 on a flat axis."""
+    span = high.astype(np.float64) - low
+    steps = 65535 / np.where(span > 0, span, 1.0)
+    return np.rint((means - low.astype(np.float64)) * steps).astype(np.uint16)
+
+
+def opacity_bytes(logits: Float32) -> NDArray[np.uint8]:
+    """Return the opacity in 255ths, rounded."""
+    from gsplat_tools.attributes.activations import sigmoid
+
+    return np.rint(sigmoid(logits.astype(np.float64)) * 255).astype(np.uint8)
+
+
+def choose_labels(points: Float32, centroids: Float32, error: float, tolerance: float, previous: Labels | None) -> Labels:
+    """Return the nearest entry of every splat, or the one it had where that adds at most `tolerance` times `error`."""
+    from gsplat_tools.codecs.palette import nearest_labels
+
+    labels, distances = nearest_labels(points, centroids)
+    if previous is not None:
+        offsets = points - centroids[previous]
+        keeps = np.einsum("nd,nd->n", offsets, offsets) <= distances + np.float32(tolerance * error)
+        labels = np.where(keeps, previous, labels)
+    return labels.astype(np.uint16)
+
+
+def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: Sog4dOptions) -> None:
+    """Write a bundle; peak memory is a few frames and the sample, however many frames there are.
+
+    Raises
+    ------
+    CapabilityError
+        The format cannot hold the scene: no splat, a band above 3, a layout too small, times of the wrong length.
+    CloudError
+        Values are not finite, or a frame differs from the first in count or degree.
+    """
+    frames = _Frames(scene)
+    width, height = _choose_layout(frames.num_splats, options)
+    times = _choose_times(scene, len(frames), options)
+    with stage("fitting codebooks", len(frames), "frames") as progress:
+        sample = draw_sample((frames[i] for i in _counted(len(frames), progress)), len(frames), options.seed)
+        shared = fit_shared(sample, frames[0], options, (width, height))
+    del sample
+    uses_deltas = options.labels == "delta-v1" or (options.labels == "auto" and len(frames) > 1)
+    segments = _segments(len(frames), options.delta_segment_length)
+    archive = ZipWriter(stream)
+    deltas = _DeltaFiles(shared, segments) if uses_deltas else None
+    ranges: list[tuple[Float32, Float32]] = []
+    clipped: dict[str, int] = {}
+
+    def images() -> Iterator[tuple[str, Image]]:
+        previous: dict[str, Labels] | None = None
+        starts = {start for start, _ in segments}
+        for frame_id in range(len(frames)):
+            planes = encode_frame(frames[frame_id], shared, None if frame_id in starts else previous)
+            ranges.append((planes.range_min, planes.range_max))
+            for name, number in planes.clipped.items():
+                clipped[name] = clipped.get(name, 0) + number
+            if deltas is not None:
+                deltas.add(frame_id, planes.labels)
+            for name in sorted(planes.images):
+                if name in PATHS or deltas is None or frame_id in starts:
+                    yield f"frames/{frame_id:05d}/{name}.webp", planes.images[name]
+            previous = planes.labels
+
+    def compress(item: tuple[str, Image]) -> tuple[str, bytes]:
+        name, image = item
+        return name, _webp.encode_rgba(image, options.webp_effort)
+
+    image_compression: Compression = "deflated" if options.zip == "deflated" else "stored"
+    data_compression: Compression = "stored" if options.zip == "stored" else "deflated"
+    with stage("encoding", len(frames), "frames") as progress:
+        for name, data in map_ordered(compress, images()):
+            archive.add(name, data, image_compression)
+            if name.endswith("/sh0.webp"):
+                progress.advance(1)
+    entries = {
+        "meta.json": meta_text(_meta(shared, frames.num_splats, segments if uses_deltas else None, times, ranges)),
+        **{_centroids_path(palette): _centroid_bytes(palette, options) for palette in shared.palettes},
+        **({} if deltas is None else deltas.files),
+    }
+    for name in sorted(entries):
+        archive.add(name, entries[name], data_compression)
+    archive.close()
+    if clipped:
+        count = clipped["sh0"]
+        message = f"colors of {count} splats lie outside the sh0 codebook and were clamped; use --sh0-codebook fit"
+        warnings.warn(LossyConversionWarning(message, code="clamped-sh0"), stacklevel=3)
+
+
+class _Frames:
+    """Frames of a scene, each checked when it is loaded; the last one is kept."""
+
+    def __init__(self, scene: GaussianCloud | GaussianSequence) -> None:
+        self._scene = scene
+        self._degree = scene.sh_degree
+        self.num_splats = scene.num_splats if isinstance(scene, GaussianSequence) else len(scene)
+        self._kept: tuple[int, GaussianCloud] | None = None
+        if self.num_splats == 0:
+            raise CapabilityError("a .sog4d bundle needs at least one splat, the scene has none")
+        if self._degree > 3:
+            raise CapabilityError(f"a .sog4d bundle holds SH bands up to 3, the scene has {self._degree}")
+
+    def __len__(self) -> int:
+        return len(self._scene) if isinstance(self._scene, GaussianSequence) else 1
+
+    def __getitem__(self, frame_id: int) -> GaussianCloud:
+        if self._kept is not None and self._kept[0] == frame_id:
+            return self._kept[1]
+        cloud = self._scene.frame(frame_id) if isinstance(self._scene, GaussianSequence) else self._scene
+        for what, found, expected in (
+            ("splats", len(cloud), self.num_splats),
+            ("as its SH degree", cloud.sh_degree, self._degree),
+        ):
+            if found != expected:
+                message = f"every frame needs {expected} {what} like the first, this one has {found}"
+                raise CloudError(message, frame=frame_id)
+        check_finite(cloud, frame_id)
+        self._kept = (frame_id, cloud)
+        return cloud
+
+
+class _DeltaFiles:
+    """Changes of labels, gathered segment by segment."""
+
+    def __init__(self, shared: Shared, segments: list[tuple[int, int]]) -> None:
+        self._shared = shared
+        self._ends = {start + count - 1: start for start, count in segments}
+        self._starts = {start for start, _ in segments}
+        self._before: dict[str, Labels] = {}
+        self._blocks: dict[str, list[NDArray[Any]]] = {}
+        self.files: dict[str, bytes] = {}
+
+    def add(self, frame: int, labels: dict[str, Labels]) -> None:
+        """Take the labels of the next frame."""
+        for palette in self._shared.palettes:
+            current = labels[palette.name]
+            if frame in self._starts:
+                self._blocks[palette.name] = []
+            else:
+                self._blocks[palette.name].append(label_files.changes(self._before[palette.name], current))
+            self._before[palette.name] = current
+            if frame in self._ends:
+                start = self._ends[frame]
+                self.files[_delta_path(palette.name, start)] = label_files.write_delta(
+                    start, len(current), len(palette.centroids), self._blocks[palette.name]
+                )
+
+
+def _counted(count: int, progress: Any) -> Iterator[int]:
+    for i in range(count):
+        yield i
+        progress.advance(1)
+
+
+def _choose_layout(count: int, options: Sog4dOptions) -> tuple[int, int]:
+    """Return the layout that was asked for, completed, or a nearly square one."""
+    from gsplat_tools.ops.ordering import image_layout
+
+    width, height = options.width, options.height
+    if width is None and height is None:
+        width, height = image_layout(count)
+    elif width is None:
+        assert height is not None
+        width = -(-count // height)
+    elif height is None:
+        height = -(-count // width)
+    if width * height < count or width > MAX_SIDE or height > MAX_SIDE:
+        raise CapabilityError(
+            f"a layout of {width} x {height} does not hold {count} splats in images of at most {MAX_SIDE} x {MAX_SIDE}; "
+            "leave width and height out"
+        )
+    return width, height
+
+
+def _choose_times(
+    scene: GaussianCloud | GaussianSequence, num_frames: int, options: Sog4dOptions
+) -> NDArray[np.float64] | None:
+    """Return explicit times, or None for the uniform mapping."""
+    if options.time_mapping == "uniform":
+        return None
+    is_explicit = options.time_mapping == "explicit"
+    times: NDArray[np.float64]
+    if options.frame_times is not None:
+        times = np.asarray(options.frame_times, np.float64)
+    elif isinstance(scene, GaussianSequence) and (is_explicit or not scene.is_uniform):
+        times = scene.frame_times
+    elif is_explicit:
+        times = np.zeros(1)
+    else:
+        return None
+    if times.shape != (num_frames,):
+        raise CapabilityError(f"frame_times needs one time a frame, {num_frames}, and has {times.size}")
+    if not np.isfinite(times).all() or times.min() < 0 or times.max() > 1 or (np.diff(times) < 0).any():
+        raise CapabilityError("frame_times must be finite, in [0, 1], and not decrease")
+    return times
+
+
+def _segments(num_frames: int, length: int) -> list[tuple[int, int]]:
+    """Return (start, count) of the segments."""
+    return [(start, min(length, num_frames - start)) for start in range(0, num_frames, length)]
+
+
+def _centroids_path(palette: Palette) -> str:
+    return f"sh/{palette.name}_centroids.bin"
+
+
+def _delta_path(name: str, start: int) -> str:
+    return f"sh/{name}_delta_{start:05d}.bin"
+
+
+def _centroid_bytes(palette: Palette, options: Sog4dOptions) -> bytes:
+    return palette.centroids.astype("<f2" if options.centroids == "f16" else "<f4").tobytes()
+
+
+def _meta(
+    shared: Shared,
+    splat_count: int,
+    segments: list[tuple[int, int]] | None,
+    times: NDArray[np.float64] | None,
+    ranges: list[tuple[Float32, Float32]],
+) -> Meta:
+    """Return meta.json for what was written."""
+    from gsplat_tools import __version__
+
+    palettes = []
+    for palette in shared.palettes:
+        template = f"frames/{FRAME_TOKEN}/{palette.name}_labels.webp"
+        palettes.append(
+            PaletteMeta(
+                name=palette.name,
+                coefficients=palette.coefficients,
+                count=len(palette.centroids),
+                centroids_type=shared.options.centroids,
+                centroids_path=_centroids_path(palette),
+                labels_path=template if segments is None else None,
+                segments=tuple(
+                    Segment(start, count, frame_path(template, start), _delta_path(palette.name, start))
+                    for start, count in segments or ()
+                ),
+            )
+        )
+    return Meta(
+        version=shared.options.version,
+        splat_count=splat_count,
+        frame_count=len(ranges),
+        frame_times=times,
+        width=shared.width,
+        height=shared.height,
+        range_min=np.array([low for low, _ in ranges]),
+        range_max=np.array([high for _, high in ranges]),
+        position_hi_path=PATHS["position_hi"],
+        position_lo_path=PATHS["position_lo"],
+        scale_codebook=shared.scale_codebook,
+        scale_indices_path=PATHS["scale_indices"],
+        rotation_path=PATHS["rotation"],
+        bands=shared.bands,
+        sh0_path=PATHS["sh0"],
+        sh0_codebook=shared.sh0_codebook,
+        palettes=tuple(palettes),
+        generator=f"{GENERATOR} {__version__}",
+    )

@@ -1,0 +1,119 @@
+"""What can be chosen when a .sog4d bundle is written or read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from gsplat_tools.errors import CapabilityError
+from gsplat_tools.formats._webp import DEFAULT_EFFORT, MAX_SIDE
+from gsplat_tools.formats.sog4d.rules import MAX_CODEBOOK, MAX_PALETTE
+
+LabelEncoding = Literal["auto", "full", "delta-v1"]
+RotationMode = Literal["best", "small", "reference"]
+ZipMode = Literal["auto", "stored", "deflated"]
+ShnOrder = Literal["interleaved", "channel-major"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sog4dReadOptions:
+    """How a bundle is read.
+
+    Parameters
+    ----------
+    shn_order
+        Order of the numbers in an SH palette entry: "interleaved" as the format says, or "channel-major" for bundles of
+        ply_sequence_to_sog4d.py, which stores f_rest in the order of the PLY file.
+    """
+
+    shn_order: ShnOrder = "interleaved"
+
+    def __post_init__(self) -> None:
+        _check_choice("shn_order", self.shn_order, get_args(ShnOrder))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sog4dOptions:
+    """How a bundle is written.
+
+    Parameters
+    ----------
+    version
+        1: one SH palette over all bands; 2: one a band (smaller error, a label image more for each).
+    labels
+        "full" label images for every frame, "delta-v1" images and changes by segment, or "auto": delta-v1 for more than
+        one frame.
+    delta_segment_length
+        Frames in a segment. Segments do not depend on each other, also with full labels: nothing is kept over from the
+        frame before at their start.
+    scale_codebook_size
+        Entries of the codebook of scale triples, at most 65,535; by default chosen from the number of splats.
+    sh_palette_size
+        Entries of each SH palette, at most 65,535; by default chosen from the number of splats.
+    centroids
+        Numbers in SH palettes: "f16" or "f32".
+    sh0_codebook
+        "fit": the optimum for the data; "base-rgb": the fixed table of 256 colors in [0, 1].
+    webp_effort
+        0 (fastest) to 9 (smallest).
+    zip
+        "stored", "deflated", or "auto": images stored, the rest deflated.
+    rotation
+        "best": smallest error; "small": smallest file; "reference": the unit quaternion rounded.
+    keep_tolerance
+        In sequences a splat keeps its scale and SH labels of the frame before as long as that adds no more than this
+        share of the palette's own mean squared error.
+    time_mapping
+        "uniform", "explicit", or "auto": as the source has it.
+    frame_times
+        Explicit times in [0, 1], one a frame; by default those of the source.
+    width, height
+        Layout of the images; by default the smallest that is nearly square.
+    seed
+        Of the palette.
+    """
+
+    version: Literal[1, 2] = 1
+    labels: LabelEncoding = "auto"
+    delta_segment_length: int = 32
+    scale_codebook_size: int | None = None
+    sh_palette_size: int | None = None
+    centroids: Literal["f16", "f32"] = "f16"
+    sh0_codebook: Literal["fit", "base-rgb"] = "fit"
+    webp_effort: int = DEFAULT_EFFORT
+    zip: ZipMode = "auto"
+    rotation: RotationMode = "best"
+    keep_tolerance: float = 0.05
+    time_mapping: Literal["auto", "uniform", "explicit"] = "auto"
+    frame_times: Sequence[float] | None = None
+    width: int | None = None
+    height: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _check_choice("version", self.version, (1, 2))
+        _check_choice("labels", self.labels, get_args(LabelEncoding))
+        _check_choice("centroids", self.centroids, ("f16", "f32"))
+        _check_choice("sh0_codebook", self.sh0_codebook, ("fit", "base-rgb"))
+        _check_choice("zip", self.zip, get_args(ZipMode))
+        _check_choice("rotation", self.rotation, get_args(RotationMode))
+        _check_choice("time_mapping", self.time_mapping, ("auto", "uniform", "explicit"))
+        _check_range("delta_segment_length", self.delta_segment_length, 1, 1 << 31)
+        _check_range("scale_codebook_size", self.scale_codebook_size, 1, MAX_CODEBOOK)
+        _check_range("sh_palette_size", self.sh_palette_size, 1, MAX_PALETTE)
+        _check_range("webp_effort", self.webp_effort, 0, 9)
+        _check_range("width", self.width, 1, MAX_SIDE)
+        _check_range("height", self.height, 1, MAX_SIDE)
+        if not 0 <= self.keep_tolerance < float("inf"):
+            raise CapabilityError(f"keep_tolerance must be 0 or more, got {self.keep_tolerance}")
+
+
+def _check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
+    if value not in choices:
+        raise CapabilityError(f"{name} must be one of {', '.join(map(str, choices))}, got {value!r}")
+
+
+def _check_range(name: str, value: int | None, low: int, high: int) -> None:
+    if value is not None and not low <= value <= high:
+        raise CapabilityError(f"{name} must be {low} to {high}, got {value}")
