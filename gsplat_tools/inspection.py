@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.attributes import activations
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.comparison import compare_with_pictures, still
 from gsplat_tools.constants import VISIBLE_OPACITY
+from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats.base import FileInfo, Format
-from gsplat_tools.formats.loading import inspect_file, open_scene
+from gsplat_tools.formats.loading import inspect_file, load, open_scene
 from gsplat_tools.ops.recentering import position_step
+from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
+
+if TYPE_CHECKING:
+    from gsplat_tools.reference.camera import Camera
 
 PERCENTILES = (0.1, 1, 5, 25, 50, 75, 95, 99, 99.9)
 HISTOGRAM_BINS = 32
@@ -189,3 +195,128 @@ def _overdraw_hint(cloud: GaussianCloud) -> list[Hint]:
             "overdraw", f"the largest 1 % of the splats have {100 * share:.0f} % of the total area: they dominate drawing time"
         )
     ]
+
+
+def _load_with_model(path: Path, model: str | None) -> tuple[GaussianCloud | GaussianSequence, tuple[str, str | None]]:
+    """Return a scene and the model that draws it: the one asked for, or that of its format."""
+    record, _ = inspect_file(path)
+    return load(path), record.model if model is None else (model, None)
+
+
+def _cameras(scene: GaussianCloud, camera_file: Path | None, views: int, size: tuple[int, int]) -> Sequence[Camera]:
+    """Return the cameras of a file, or automatic ones."""
+    from gsplat_tools.reference.auto_cameras import auto_cameras
+    from gsplat_tools.reference.camera import load_cameras
+
+    return auto_cameras(scene, views=views, size=size) if camera_file is None else load_cameras(camera_file)
+
+
+def compare_files(
+    reference: Path,
+    candidate: Path,
+    *,
+    views: int,
+    size: tuple[int, int],
+    camera_file: Path | None = None,
+    model: str | None = None,
+    t: float | None = None,
+    images: Path | None = None,
+) -> dict[str, Any]:
+    """Compare two files and return what `gsplat-inspect compare --json` prints.
+
+    Parameters
+    ----------
+    reference, candidate
+        Files to compare.
+    views, size, camera_file
+        Automatic views and their size, px; or a file of cameras.
+    model
+        Rendering model; by default that of the candidate's format.
+    t
+        Normalized time at which sequences and motion are evaluated.
+    images
+        Folder for one picture a view: reference, candidate, amplified difference.
+
+    Raises
+    ------
+    FormatError
+        The bytes of a file are at fault.
+    """
+    from gsplat_tools.reference.pictures import contact_sheet, difference_picture
+
+    scene, _ = _load_with_model(reference, model)
+    other, (name, variant) = _load_with_model(candidate, model)
+    cameras = _cameras(still(scene, t), camera_file, views, size)
+    report, pictures = compare_with_pictures(scene, other, cameras=cameras, model=name, variant=variant, t=t)
+    if images is not None:
+        images.mkdir(parents=True, exist_ok=True)
+        for index, (a, b) in enumerate(pictures):
+            _write_png(contact_sheet([a, b, difference_picture(a, b)], columns=3), images / f"view_{index}.png", overwrite=True)
+    return asdict(report)
+
+
+def render_file(
+    file: Path,
+    target: Path,
+    *,
+    camera: str,
+    views: int,
+    model: str | None,
+    variant: str | None,
+    size: tuple[int, int],
+    t: float | None,
+    framebuffer: Any,
+    overwrite: bool,
+) -> dict[str, Any]:
+    """Draw a file into a PNG and return what was drawn.
+
+    Parameters
+    ----------
+    file, target
+        Scene and picture.
+    camera
+        "auto" or a file of cameras.
+    views, size
+        Automatic views and their size, px; several views make a contact sheet.
+    model, variant
+        Rendering model; by default that of the file's format.
+    t
+        Normalized time at which sequences and motion are evaluated.
+    framebuffer
+        "float", or "unorm8" to round after every blend.
+    overwrite
+        Replace a picture that is there.
+
+    Raises
+    ------
+    FormatError
+        The bytes of a file are at fault.
+    TargetExistsError
+        The picture is there and `overwrite` is false.
+    """
+    from gsplat_tools.reference.pictures import contact_sheet
+    from gsplat_tools.reference.rasterizer import render
+
+    scene, (name, default_variant) = _load_with_model(file, model)
+    cloud = still(scene, t)
+    cameras = _cameras(cloud, None if camera == "auto" else Path(camera), views, size)
+    drawn = []
+    with stage("rendering", len(cameras), "views") as progress:
+        for one in cameras:
+            drawn.append(render(cloud, one, model=name, variant=variant or default_variant, t=t, framebuffer=framebuffer))
+            progress.advance(1)
+    _write_png(contact_sheet([rendering.image for rendering in drawn]), target, overwrite=overwrite)
+    return {
+        "picture": str(target),
+        "model": name,
+        "variant": variant or default_variant,
+        "views": [asdict(rendering.counts) for rendering in drawn],
+    }
+
+
+def _write_png(picture: NDArray[np.uint8], path: Path, *, overwrite: bool) -> None:
+    """Write an 8-bit picture."""
+    from PIL import Image
+
+    with replacing(path, overwrite=overwrite) as stream:
+        Image.fromarray(picture).save(stream, format="PNG", optimize=True)

@@ -240,7 +240,8 @@ def _summary(report: dict[str, Any]) -> str:
     if validation["psnr_min"] is not None:
         lines.append(
             f"  rendered ({validation['model']}): PSNR min {validation['psnr_min']:.2f} dB, "
-            f"mean {validation['psnr_mean']:.2f} dB, SSIM {validation['ssim_mean']:.5f}, largest difference {validation['max_abs']:.4f}"
+            f"mean {validation['psnr_mean']:.2f} dB, SSIM {output.number(validation['ssim_mean'], 5)}, "
+            f"largest difference {validation['max_abs']:.4f}"
         )
     elif validation.get("identical"):
         lines.append(f"  rendered ({validation['model']}): identical")

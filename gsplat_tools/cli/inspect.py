@@ -56,9 +56,11 @@ def info(file: Path, *, as_json: bool) -> None:
 def _plain(value: Any) -> str:
     """Return a value of a report for people."""
     if isinstance(value, dict):
+        if len(value) > 12:
+            return f"{len(value)} entries (see --json)"
         return ", ".join(f"{name} {_plain(item)}" for name, item in value.items()) or "-"
     if isinstance(value, list | tuple):
-        return f"({', '.join(map(_plain, value))})" if len(value) <= 12 else f"{len(value)} values"
+        return f"({', '.join(map(_plain, value))})" if len(value) <= 12 else f"{len(value)} values (see --json)"
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
     if isinstance(value, int):
@@ -128,7 +130,7 @@ def compare(
     progress: bool,
 ) -> None:
     """Compare two files by their attributes and by what a target would show."""
-    from gsplat_tools.comparison import compare_files
+    from gsplat_tools.inspection import compare_files
     from gsplat_tools.parallel import use_jobs
 
     with use_jobs(jobs), output.showing_progress(progress):
@@ -149,7 +151,7 @@ def compare(
         (
             view["name"],
             "identical" if view["psnr"] is None else f"{view['psnr']:.2f}",
-            f"{view['ssim']:.5f}",
+            output.number(view["ssim"], 5),
             f"{view['max_abs']:.4f}",
             f"{100 * view['share_above_1']:.2f}",
             f"{100 * view['share_above_8']:.2f}",
@@ -162,7 +164,7 @@ def compare(
     else:
         click.echo(
             f"{report['model']}: PSNR min {report['psnr_min']:.2f} dB ({report['worst_view']}), "
-            f"mean {report['psnr_mean']:.2f} dB, SSIM {report['ssim_mean']:.5f}"
+            f"mean {report['psnr_mean']:.2f} dB, SSIM {output.number(report['ssim_mean'], 5)}"
         )
 
 
@@ -191,7 +193,7 @@ def compare(
 @reports_errors
 def render(file: Path, *, target: Path, jobs: int | None, as_json: bool, progress: bool, **given: Any) -> None:
     """Draw a scene as its target would show it."""
-    from gsplat_tools.comparison import render_file
+    from gsplat_tools.inspection import render_file
     from gsplat_tools.parallel import use_jobs
 
     with use_jobs(jobs), output.showing_progress(progress):

@@ -1,10 +1,10 @@
-"""How far one scene is from another: errors per attribute against derived bounds, and rendered pictures."""
+"""Errors per attribute, in spaces where two encodings of the same splat agree, against derived bounds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,6 @@ from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CloudError
 from gsplat_tools.formats.base import Bounds
-from gsplat_tools.progress import stage
-from gsplat_tools.sequence import GaussianSequence
-
-if TYPE_CHECKING:
-    from gsplat_tools.reference.camera import Camera
-
-MAX_RENDERED = 250_000
-"""Splats of a scene in chunks that are rendered: every k-th of a larger one, so that memory stays bounded."""
 
 _FLOAT32_SLACK = 4e-7
 """Decoders compute in float32: a few roundings of 2^-24 relative to the value come on top of a bound."""
@@ -71,57 +63,6 @@ class AttributeStatistics:
         }
         finite = {name: None if value is None or not np.isfinite(value) else value for name, value in numbers.items()}
         return {**finite, "exceeded": self.exceeded if self.bound is not None else None}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ViewReport:
-    """How one view differs."""
-
-    name: str
-    psnr: float | None
-    ssim: float
-    max_abs: float
-    mean_abs: float
-    share_above_1: float
-    share_above_8: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ComparisonReport:
-    """How far a candidate is from its reference.
-
-    Parameters
-    ----------
-    psnr_min, psnr_mean
-        Over the views, dB; None where every view is identical (identical views are left out of both).
-    ssim_mean
-        Mean over the views, 1 for identical pictures.
-    max_abs
-        Largest difference of a channel, 0..1.
-    identical
-        Whether every picture is the same to the bit.
-    worst_view
-        Name of the view with the lowest PSNR.
-    attributes
-        Errors per attribute, as `AttributeStatistics.to_json` gives them; empty where the splats cannot be matched.
-    views
-        One report a view.
-    model
-        Rendering model and variant that drew both sides.
-    rendered_splats
-        Splats that were drawn on each side; fewer than there are where the scene was sampled.
-    """
-
-    psnr_min: float | None
-    psnr_mean: float | None
-    ssim_mean: float
-    max_abs: float
-    identical: bool
-    worst_view: str
-    attributes: Mapping[str, Mapping[str, float | int | None]]
-    views: Sequence[ViewReport]
-    model: str
-    rendered_splats: int
 
 
 def attribute_errors(reference: GaussianCloud, candidate: GaussianCloud) -> dict[str, NDArray[np.float64]]:
@@ -220,17 +161,16 @@ class AttributeTally:
 
 def _slack(name: str, reference: GaussianCloud, bound: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return what float32 arithmetic in a decoder may add to a bound."""
-    slack = np.asarray(bound * 1e-5)
+    sizes: NDArray[np.floating[Any]] = np.ones(1)
     if name == "means":
-        return slack + _FLOAT32_SLACK * (np.abs(reference.means) + np.abs(reference.origin))
-    if name in {"sh0", "shN"} and getattr(reference, name).shape == bound.shape:
-        return slack + _FLOAT32_SLACK * np.abs(getattr(reference, name))
-    if name == "scales":
-        return slack + 2 * _FLOAT32_SLACK * np.abs(np.nan_to_num(np.sort(reference.log_scales, axis=1), neginf=0.0))
-    if name == "covariances":
-        longest = np.abs(np.nan_to_num(reference.log_scales.max(axis=1, initial=-np.inf), neginf=0.0))
-        return slack + 16 * _FLOAT32_SLACK * (1 + longest)
-    return slack + _FLOAT32_SLACK
+        sizes = np.abs(reference.means) + np.abs(reference.origin)
+    elif name in {"sh0", "shN"} and getattr(reference, name).shape == bound.shape:
+        sizes = np.abs(getattr(reference, name))
+    elif name == "scales":
+        sizes = 2 * np.abs(np.nan_to_num(np.sort(reference.log_scales, axis=1), neginf=0.0))
+    elif name == "covariances":
+        sizes = 16 * (1 + np.abs(np.nan_to_num(reference.log_scales.max(axis=1, initial=-np.inf), neginf=0.0)))
+    return np.asarray(bound * 1e-5 + _FLOAT32_SLACK * sizes, np.float64)
 
 
 def paired(
@@ -245,167 +185,6 @@ def paired(
         yield a.take(slice(0, count)), b.take(slice(0, count))
         a = a.take(slice(count, None)) if count < len(a) else next(streams[0], None)
         b = b.take(slice(count, None)) if count < len(b) else next(streams[1], None)
-
-
-def sample(scene: GaussianCloud | CloudChunks, limit: int = MAX_RENDERED) -> GaussianCloud:
-    """Return the cloud, or every k-th splat of chunks that hold more than `limit`."""
-    if isinstance(scene, GaussianCloud):
-        return scene
-    step = -(-len(scene) // limit)
-    if step <= 1:
-        return scene.read()
-    start = 0
-
-    def every_kth(chunk: GaussianCloud) -> GaussianCloud:
-        nonlocal start
-        first, start = -start % step, start + len(chunk)
-        return chunk.take(slice(first, None, step))
-
-    pieces = [every_kth(chunk) for chunk in scene]
-    thinned = iter(pieces)
-    return CloudChunks(sum(map(len, pieces)), scene.template, lambda: thinned).read()
-
-
-def compare_rendered(
-    pairs: Sequence[tuple[str, GaussianCloud, GaussianCloud]],
-    cameras: Sequence[Camera],
-    model: tuple[str, str | None],
-    *,
-    t: float | None = None,
-    attributes: Mapping[str, Mapping[str, float | int | None]] | None = None,
-) -> tuple[ComparisonReport, list[tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]]]:
-    """Draw both sides from every camera and measure the difference.
-
-    Parameters
-    ----------
-    pairs
-        (label, reference, candidate); one pair for a still scene, one a frame for sequences.
-    cameras
-        Views of each pair.
-    model
-        Rendering model and variant, the same for both sides.
-    t
-        Time at which motion is evaluated.
-    attributes
-        Attribute errors to put into the report.
-
-    Returns
-    -------
-    tuple
-        The report, and the pictures of reference and candidate per view.
-    """
-    from gsplat_tools.reference import image_metrics
-    from gsplat_tools.reference.rasterizer import render
-
-    name, variant = model
-    views: list[ViewReport] = []
-    pictures = []
-    with stage("rendering", 2 * len(pairs) * len(cameras), "views") as progress:
-        for label, reference, candidate in pairs:
-            for index, camera in enumerate(cameras):
-                images = []
-                for cloud in (reference, candidate):
-                    images.append(render(cloud, camera, model=name, variant=variant, t=t).image)  # type: ignore[arg-type]
-                    progress.advance(1)
-                metrics = image_metrics.compare_images(images[0], images[1])
-                views.append(
-                    ViewReport(
-                        name=f"{label}view {index}",
-                        psnr=metrics.psnr,
-                        ssim=metrics.ssim,
-                        max_abs=metrics.max_abs,
-                        mean_abs=metrics.mean_abs,
-                        share_above_1=metrics.share_above_1,
-                        share_above_8=metrics.share_above_8,
-                    )
-                )
-                pictures.append((images[0], images[1]))
-    levels = [view.psnr for view in views if view.psnr is not None]
-    worst = min(views, key=lambda view: np.inf if view.psnr is None else view.psnr)
-    report = ComparisonReport(
-        psnr_min=min(levels) if levels else None,
-        psnr_mean=float(np.mean(levels)) if levels else None,
-        ssim_mean=float(np.mean([view.ssim for view in views])),
-        max_abs=max(view.max_abs for view in views),
-        identical=not levels,
-        worst_view=worst.name,
-        attributes=attributes or {},
-        views=views,
-        model=name if variant is None else f"{name} {variant}",
-        rendered_splats=len(pairs[0][1]),
-    )
-    return report, pictures
-
-
-def still(scene: GaussianCloud | GaussianSequence, t: float | None) -> GaussianCloud:
-    """Return the cloud of a scene at a time; a sequence without a time gives its first frame as stored."""
-    if isinstance(scene, GaussianCloud):
-        return scene
-    return scene.frame(0) if t is None else scene.at(t)
-
-
-def compare(
-    reference: GaussianCloud | GaussianSequence,
-    candidate: GaussianCloud | GaussianSequence,
-    *,
-    views: int = 8,
-    size: tuple[int, int] = (640, 360),
-    model: str | None = None,
-    variant: str | None = None,
-    t: float | None = None,
-    cameras: Sequence[Camera] | None = None,
-) -> ComparisonReport:
-    """Compare two scenes by their attributes and by what a target would show.
-
-    Parameters
-    ----------
-    reference, candidate
-        Scenes; attributes are compared where both have the same splats (matched by position if their order differs).
-    views
-        Number of automatic views of the reference.
-    size
-        Width and height of the pictures, px.
-    model, variant
-        Rendering model; "inria" by default.
-    t
-        Normalized time at which sequences and motion are evaluated.
-    cameras
-        Views to use instead of automatic ones.
-
-    Returns
-    -------
-    ComparisonReport
-        PSNR of both pictures clamped to [0, 1], peak 1, on black.
-    """
-    return compare_with_pictures(
-        reference, candidate, views=views, size=size, model=model, variant=variant, t=t, cameras=cameras
-    )[0]
-
-
-def compare_with_pictures(
-    reference: GaussianCloud | GaussianSequence,
-    candidate: GaussianCloud | GaussianSequence,
-    *,
-    views: int = 8,
-    size: tuple[int, int] = (640, 360),
-    model: str | None = None,
-    variant: str | None = None,
-    t: float | None = None,
-    cameras: Sequence[Camera] | None = None,
-) -> tuple[ComparisonReport, list[tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]]]:
-    """Return what `compare` returns and the pairs of pictures it is about."""
-    from gsplat_tools.reference.auto_cameras import auto_cameras
-
-    first, second = still(reference, t), still(candidate, t)
-    chosen = list(cameras) if cameras is not None else auto_cameras(first, views=views, size=size)
-    attributes = {}
-    matched = match_splats(first, second)
-    if matched is not None:
-        tally = AttributeTally()
-        for a, b in paired(first, second if isinstance(matched, slice) else second.take(matched)):
-            tally.add(a, b)
-        attributes = tally.to_json()
-    return compare_rendered([("", first, second)], chosen, (model or "inria", variant), t=t, attributes=attributes)
 
 
 def match_splats(reference: GaussianCloud, candidate: GaussianCloud) -> NDArray[np.intp] | slice | None:

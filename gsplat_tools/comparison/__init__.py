@@ -1,0 +1,26 @@
+"""How far one scene is from another: errors per attribute against derived bounds, and rendered pictures."""
+
+from gsplat_tools.comparison.attributes import AttributeTally, attribute_errors, match_splats, paired
+from gsplat_tools.comparison.rendered import (
+    ComparisonReport,
+    ViewReport,
+    compare,
+    compare_rendered,
+    compare_with_pictures,
+    sample,
+    still,
+)
+
+__all__ = [
+    "AttributeTally",
+    "ComparisonReport",
+    "ViewReport",
+    "attribute_errors",
+    "compare",
+    "compare_rendered",
+    "compare_with_pictures",
+    "match_splats",
+    "paired",
+    "sample",
+    "still",
+]
