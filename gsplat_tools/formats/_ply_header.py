@@ -139,7 +139,7 @@ def read_header(stream: BinaryIO) -> PlyHeader:
     offset = 0
     for raw_line in raw.split(separator):
         line = raw_line.strip()
-        keyword, _, rest = line.partition(b" ")
+        keyword, rest = (*line.split(None, 1), b"", b"")[:2]
         if keyword == b"comment":
             comments.append(rest.decode("utf-8", "replace").strip())
             line = b"comment"
@@ -174,7 +174,9 @@ def _read_raw_header(stream: BinaryIO) -> bytes:
         head += part
         start = re.match(rb"ply[ \t]*(\r\n|\n|\r(?!\n))", head)
         if start is None:
-            if not part and len(head) < 5 and b"ply\r\n".startswith(head.rstrip(b" \t")):
+            if b"ply\r\n".startswith(head.rstrip(b" \t")):  # so far, so good
+                if part:
+                    continue
                 raise TruncatedDataError(f"the file ends after {len(head)} bytes, inside the PLY header", offset=len(head))
             raise CorruptDataError(f"expected a first line 'ply', found {head[:16]!r}", offset=0)
         end = rb"\r[ \t]*end_header[ \t]*\r" if start[1] == b"\r" else rb"\n[ \t]*end_header[ \t\r]*\n"

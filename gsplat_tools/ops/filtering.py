@@ -110,6 +110,8 @@ def prune_opacity(cloud: GaussianCloud, threshold: float) -> tuple[GaussianCloud
 
 def _codes(cloud: GaussianCloud) -> NDArray[np.uint8] | None:
     """Return the code of each splat's first cause, 0 for valid ones; None where all are valid."""
+    if len(cloud) == 0:
+        return None
     from gsplat_tools.kernels import validity
 
     arrays = cloud.arrays()

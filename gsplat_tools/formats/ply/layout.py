@@ -31,6 +31,14 @@ MOTION = {
 
 MOTION_DEFAULTS = {"velocities": 0.0, "times": 0.0, "durations": 1.0}
 
+_MODEL_COMMENTS: dict[tuple[str, str], SplatModel] = {
+    ("splatrendermode", "default"): "default",
+    ("splatrendermode", "mip"): "antialiased",
+    ("splatrendermode", "2dgs"): "2dgs",
+    ("antialiased", "0"): "default",
+    ("antialiased", "1"): "antialiased",
+}
+
 _REST_NAME = re.compile(r"f_rest_([0-9]{1,4})")
 # Positions of these types are exact in float32 as they are.
 _NARROW_TYPES = {("f", 4), ("i", 1), ("u", 1), ("i", 2), ("u", 2)}
@@ -214,8 +222,8 @@ def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
 
     Source
     ------
-    `SplatRenderMode: mip` is written by Brush and PostShot-like trainers, `antialiased 1` by gsplat's and OpenSplat's
-    exporters; origin, coordinate_system and time_model are ours.
+    `SplatRenderMode: default | mip | 2dgs` is Brush's comment, `antialiased 0 | 1` is Postshot's; the last one wins, as in
+    splat-transform. origin, coordinate_system and time_model are ours.
     """
     model: SplatModel = "default"
     system, origin = "unknown", np.zeros(3)
@@ -223,8 +231,8 @@ def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
     for comment in header.comments:
         words = comment.replace(":", " ").split()
         key, values = (words[0].lower(), words[1:]) if words else ("", [])
-        if (key == "splatrendermode" and [v.lower() for v in values] == ["mip"]) or (key == "antialiased" and values == ["1"]):
-            model = "antialiased"
+        if key in {"splatrendermode", "antialiased"} and len(values) == 1:
+            model = _MODEL_COMMENTS.get((key, values[0].lower()), model)
         elif key == "coordinate_system" and len(values) == 1 and is_known(values[0]):
             system = values[0]
         elif key == "time_model" and values in (["window"], ["gaussian"]):

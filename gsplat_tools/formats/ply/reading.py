@@ -114,9 +114,11 @@ class PlyReader:
         def fill(first: int, last: int) -> None:
             records = self._rows.block(start + first, start + last)
             part = cloud.take(slice(first, last))  # views
-            if self._fill_splats(records, part):
-                normals_found.set()
-            _fill_motion(records, layout, part)
+            # A double beyond float32 becomes infinite, which the filter of invalid splats counts.
+            with np.errstate(over="ignore", invalid="ignore"):
+                if self._fill_splats(records, part):
+                    normals_found.set()
+                _fill_motion(records, layout, part)
             for name, values in extra.items():
                 values[first:last] = records[name]
 
@@ -183,9 +185,9 @@ class PlyReader:
         """Return the box of the finite positions of a block, and whether float32 holds them exactly."""
         records = self._rows.block(*part)
         positions = np.stack([records[name].astype(np.float64) for name in MEANS], axis=1)
-        positions = positions[np.isfinite(positions).all(axis=1)]
-        with np.errstate(over="ignore"):
-            is_exact = bool((positions.astype(np.float32) == positions).all())
+        # One splat out at 1e300, which float32 cannot hold anyway, must not carry the origin away.
+        positions = positions[(np.abs(positions) <= np.finfo(np.float32).max).all(axis=1)]
+        is_exact = bool((positions.astype(np.float32) == positions).all())
         return positions.min(axis=0, initial=np.inf), positions.max(axis=0, initial=-np.inf), is_exact
 
 

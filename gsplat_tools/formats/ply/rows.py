@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import os
 import threading
+import warnings
 from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_tools.errors import CorruptDataError, TruncatedDataError
+from gsplat_tools.errors import CorruptDataError, GsplatWarning, TruncatedDataError
 from gsplat_tools.formats._ply_header import PlyElement, PlyHeader, check_text_claim, element_offsets
 from gsplat_tools.formats._stream import read_into
 
@@ -142,7 +143,10 @@ def _parse(stream: BinaryIO, header: PlyHeader, elements: tuple[PlyElement, ...]
     joined = io.BufferedReader(_Joined(_declare(header, elements), stream), 1 << 16)
     source = io.TextIOWrapper(joined, "ascii") if header.encoding == "ascii" else joined
     try:
-        with np.errstate(over="ignore"):  # 1e99 as float32 is infinite, and is reported as such
+        with np.errstate(over="ignore"), warnings.catch_warnings():
+            # 1e99 as float32 is infinite, which the filter of invalid splats counts.
+            warnings.filterwarnings("ignore", "overflow encountered", RuntimeWarning)
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data", UserWarning)  # empty lists are legal
             parsed = plyfile.PlyData.read(source, mmap=False)
         rest = source.read() if header.encoding == "ascii" else ""
     except plyfile.PlyElementParseError as error:
@@ -153,12 +157,23 @@ def _parse(stream: BinaryIO, header: PlyHeader, elements: tuple[PlyElement, ...]
         ) from error
     except (plyfile.PlyParseError, ValueError, OverflowError) as error:
         raise CorruptDataError(f"the values cannot be read: {error}", offset=offset) from error
+    if header.encoding == "ascii" and not _ends_a_line(stream):
+        warnings.warn(
+            GsplatWarning("the text ends without a line end: its last number may have been cut off", code="no-line-end"),
+            stacklevel=6,
+        )
     if rest.strip():
         raise CorruptDataError(
             f"{len(rest.strip())} bytes of text follow the last element, starting with {rest.split()[0][:20]!r}",
             field=header.elements[-1].name,
         )
     return cast("NDArray[Any]", parsed["vertex"].data)
+
+
+def _ends_a_line(stream: BinaryIO) -> bool:
+    """Whether the last byte ends a line."""
+    stream.seek(-1, io.SEEK_END)
+    return stream.read(1) in {b"\n", b"\r"}
 
 
 def _declare(header: PlyHeader, elements: tuple[PlyElement, ...]) -> bytes:

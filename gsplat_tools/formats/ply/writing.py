@@ -122,6 +122,8 @@ def _header(template: GaussianCloud, count: int, splat_names: list[str], tail: l
     lines = ["ply", "format binary_little_endian 1.0"]
     if template.splat_model == "antialiased":
         lines += ["comment SplatRenderMode: mip", "comment antialiased 1"]
+    elif template.splat_model == "2dgs":
+        lines.append("comment SplatRenderMode: 2dgs")
     if template.coordinate_system != "unknown":
         lines.append(f"comment coordinate_system {template.coordinate_system}")
     if template.origin.any():
@@ -174,4 +176,7 @@ def _tail_columns(
                 yield spellings[0], values[:, column]
     for name, _, (key, column_or_none) in extras:
         values = chunk.extra[key]
-        yield name, values if column_or_none is None else values.reshape(len(chunk), -1)[:, column_or_none]
+        yield (
+            name,
+            values if column_or_none is None else values.reshape(len(chunk), int(np.prod(values.shape[1:])))[:, column_or_none],
+        )
