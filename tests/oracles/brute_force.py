@@ -7,7 +7,7 @@ import numpy as np
 from tests.oracles.oracle_models import MAX_DEGREE, MODELS
 from tests.oracles.oracle_projection import Camera
 
-DEFAULT_VARIANTS = {"inria": None, "unity": "1.2.1", "spark": "packed", "visionary": None}
+DEFAULT_VARIANTS = {"inria": None, "unity": "1.2.1", "spark": "packed", "visionary": "half"}
 
 
 @dataclass

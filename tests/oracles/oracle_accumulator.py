@@ -24,6 +24,8 @@ class Ties:
         if np.isfinite(rounded):
             step = 2.0 ** (max(np.frexp(value)[1] - 1, -14) - 10) if value else 1.0
             self.margin = min(self.margin, abs(value / step - np.floor(value / step) - 0.5))
+            if np.float16(np.float32(value)) != rounded:
+                self.margin = 0.0  # a target that computes in float32 rounds twice
         return float(rounded)
 
 
@@ -65,17 +67,17 @@ def _octahedral(quat, axis_steps, angle_steps, ties):
     """Return a unit quaternion through the octahedral axis and the angle."""
     if quat[0] < 0:
         quat = -quat
+    angle = ties.round(2 * np.arctan2(np.linalg.norm(quat[1:]), quat[0]) * angle_steps / np.pi, 0, angle_steps)
+    if angle == 0:
+        return np.array([1.0, 0, 0, 0])
     ties.margin = min(ties.margin, abs(quat[0]))
-    length = np.linalg.norm(quat[1:])
-    theta = 2 * np.arctan2(length, quat[0])
-    axis = quat[1:] / length if length >= 1e-6 else np.array([1.0, 0, 0])
+    axis = quat[1:] / np.linalg.norm(quat[1:])
     px, py = axis[:2] / np.abs(axis).sum()
     if axis[2] < 0:
         ties.margin = min(ties.margin, abs(px), abs(py))
         px, py = (1 - abs(py)) * (1 if px >= 0 else -1), (1 - abs(px)) * (1 if py >= 0 else -1)
     u = ties.round((px / 2 + 0.5) * axis_steps, 0, axis_steps)
     v = ties.round((py / 2 + 0.5) * axis_steps, 0, axis_steps)
-    angle = ties.round(theta * angle_steps / np.pi, 0, angle_steps)
 
     fx, fy = 2 * u / axis_steps - 1, 2 * v / axis_steps - 1
     fz = 1 - abs(fx) - abs(fy)

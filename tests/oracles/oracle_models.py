@@ -147,7 +147,7 @@ CUTOFF = np.sqrt(np.log(255))
 
 
 def visionary(splat, camera, px, py, options):
-    """Visionary's WebGPU pipeline; variant "f16" stores the 24-byte record on the way, None does not."""
+    """Visionary's WebGPU pipeline; variant "half" stores the 24-byte record on the way, "float" does not."""
     view = _view(splat, camera)
     if view[2] <= 0:
         return None
@@ -162,7 +162,7 @@ def visionary(splat, camera, px, py, options):
     color = np.maximum(0, _color(splat, camera, min(options["degree"], 3)))
     center = p.center
     ties = oracle_accumulator.Ties()
-    if options["variant"] == "f16":
+    if options["variant"] == "half":
         size = np.array([camera.width, camera.height])
         half = np.vectorize(ties.half)
         v1, v2 = half(v1 / size) * size, half(v2 / size) * size

@@ -36,7 +36,7 @@ def _splats(*depths: float, sigma: float = 0.1, opacity: float = 0.5, colors=((1
         ("unity", "1.0", 1.0, 6.325, 0.0),
         ("unity", "1.2.1", 1.0, 6.325, np.exp((3 / np.sqrt(8 * 6.325) - 1.16) * 25)),
         ("spark", "none", 6.25 / 6.55, 6.55, 0.0),
-        ("visionary", None, np.sqrt(6.25**2 / (6.35**2 + 1e-6) + 1e-6), 6.35, 0.0),
+        ("visionary", "float", np.sqrt(6.25**2 / (6.35**2 + 1e-6) + 1e-6), 6.35, 0.0),
     ],
 )
 def test_oracle__of_one_splat_is_a_gaussian(model, variant, compensation, blurred, taken) -> None:
@@ -47,7 +47,7 @@ def test_oracle__of_one_splat_is_a_gaussian(model, variant, compensation, blurre
     np.testing.assert_allclose(picture.image[MIDDLE, MIDDLE + 3], expected * np.array([1, 0.5, 0.25]), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("model", "variant"), [("inria", None), ("unity", "1.0"), ("spark", "none"), ("visionary", None)])
+@pytest.mark.parametrize(("model", "variant"), [("inria", None), ("unity", "1.0"), ("spark", "none"), ("visionary", "float")])
 def test_oracle__puts_the_near_splat_over_the_far_one(model, variant) -> None:
     near, far = (1.0, 0, 0), (0, 1.0, 0)
     splats = _splats(2.0, 3.0, colors=(near, far), opacity=0.8, sigma=1.0)
@@ -79,7 +79,7 @@ def test_oracle__cuts_the_footprint_where_each_model_says() -> None:
     # sigma about 5 px: sqrt(8) sigma = 14 px for unity and spark, 3.0685 sigma = 15 px for visionary.
     assert reach("unity", "1.0") == 14
     assert reach("spark", "none") == 14
-    assert reach("visionary", None) == 15
+    assert reach("visionary", "half") == 15
 
 
 def test_oracle__counts_axes_that_no_gpu_can_know() -> None:
