@@ -40,8 +40,8 @@ class AttributeStatistics:
     bound: float | None = None
     exceeded: int = 0
 
-    def add(self, errors: NDArray[np.float64], bound: NDArray[Any] | None) -> None:
-        """Take the errors of one more chunk into account."""
+    def add(self, errors: NDArray[np.float64], bound: NDArray[Any] | None, slack: NDArray[np.float64] | float = 0.0) -> None:
+        """Take the errors of one more chunk into account; `slack` is what a decoder's arithmetic may add to the bound."""
         if errors.size == 0:
             return
         self.count += errors.size
@@ -50,7 +50,7 @@ class AttributeStatistics:
         self.sum_squares += float(np.square(errors).sum())
         if bound is not None:
             self.bound = max(self.bound or 0.0, float(bound.max(initial=0.0)))
-            self.exceeded += int(np.count_nonzero(~(errors <= bound)))
+            self.exceeded += int(np.count_nonzero(~(errors <= bound + slack)))
 
     def to_json(self) -> dict[str, float | int | None]:
         """Return max, mean, rms, bound and exceeded; numbers that are not finite become None."""
@@ -139,11 +139,12 @@ class AttributeTally:
         """Take one more pair of chunks into account."""
         bounds = bounds or {}
         for name, errors in attribute_errors(reference, candidate).items():
-            bound = bounds.get(name)
-            if bound is not None:
-                widened = np.broadcast_to(np.asarray(bound, np.float64), errors.shape)
-                bound = widened + _slack(name, reference, widened)
-            self.attributes.setdefault(name, AttributeStatistics()).add(errors, bound)
+            statistics = self.attributes.setdefault(name, AttributeStatistics())
+            if name in bounds:
+                bound = np.broadcast_to(np.asarray(bounds[name], np.float64), errors.shape)
+                statistics.add(errors, bound, _slack(name, reference, bound))
+            else:
+                statistics.add(errors, None)
 
     def exceeded(self) -> list[str]:
         """Return one phrase for every attribute that leaves its bound."""

@@ -79,6 +79,8 @@ class Format:
         Name for `--to`; name for people; lower-case file name endings; page in docs/.
     max_sh_degree
         Highest SH band that the format holds.
+    min_splats
+        Fewest splats that a file may hold.
     lossless
         Whether every attribute comes back with the same bits.
     holds_sequences, holds_motion, holds_extra
@@ -125,6 +127,7 @@ class Format:
     read_chunks: Callable[[BinaryIO, Any], CloudChunks] | None = None
     write: Callable[[Any, BinaryIO, Any], None] | None = None
     bounds: Callable[[GaussianCloud, BinaryIO, int], Bounds] | None = None
+    min_splats: int = 0
     lossless: bool = False
     holds_sequences: bool = False
     holds_motion: bool = False

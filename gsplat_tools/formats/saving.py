@@ -72,6 +72,11 @@ def find_target(path: Path, to: str | None) -> Format:
     return record
 
 
+def count_splats(scene: Scene) -> int:
+    """Return the splats of a scene; of one frame for a sequence."""
+    return scene.num_splats if isinstance(scene, GaussianSequence | CloudChunks) else len(scene)
+
+
 def split_options(record: Format, preset: str, options: dict[str, Any]) -> tuple[SaveChoices, Any]:
     """Divide options into those of every format and those of this one, the preset beneath them.
 
@@ -150,6 +155,9 @@ def save(
         start = time.perf_counter()
         prepared = prepare(scene, record, choices)
         prepared_at = time.perf_counter()
+        splats = count_splats(prepared.scene)
+        if splats < record.min_splats:
+            raise CapabilityError(f"{record.title} holds at least {record.min_splats} splat, and {splats} are left to write")
         record.write(prepared.scene, stream, write_options)
         stream.flush()
         size = stream_size(stream)
@@ -164,7 +172,7 @@ def save(
         path=path,
         format=record.id,
         bytes=size,
-        splats=final.num_splats if isinstance(final, GaussianSequence | CloudChunks) else len(final),
+        splats=splats,
         sh_degree=final.sh_degree,
         frames=len(final) if isinstance(final, GaussianSequence) else 1,
         dropped=prepared.dropped,

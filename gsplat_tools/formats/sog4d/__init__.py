@@ -112,6 +112,7 @@ FORMAT = Format(
     extensions=(".sog4d",),
     spec="docs/formats/sog4d.md",
     max_sh_degree=3,
+    min_splats=1,
     matches=matches,
     inspect=inspect,
     read=read,
