@@ -1,8 +1,9 @@
 """Which of the 24 frames of a Gaussian Spark's rotation code holds best: a search in float32 over what the decoder returns.
 
-The error of a frame is that of the decoded covariance. With l the squared scales, l' those decoded, and d the vector part of the
-quaternion from the source to the decoded rotation in local axes, ||Sigma' - Sigma||^2 = const + 8 sum_k (l_i - l_j)(l'_i - l'_j) d_k^2
-up to third order in d, where i and j are the axes other than k. The frame that wins is packed by the exact encoder (spark_pack).
+The error of a frame is that of the decoded covariance. With l the squared scales, l' those decoded, and d the vector part
+of the quaternion from the source to the decoded rotation in local axes, up to third order in d
+||Sigma' - Sigma||^2 = const + 8 sum_k (l_i - l_j) (l'_i - l'_j) d_k^2, where i and j are the axes other than k.
+The frame that wins is packed by the exact encoder (spark_pack).
 """
 
 import numpy as np

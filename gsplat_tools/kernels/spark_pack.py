@@ -119,8 +119,8 @@ def pack_lanes(rows, halves, ranges, words, counts):
             code = below + 1.0 if value - below >= 0.5 else below
             clamped += 1 if code < 0.0 else 0
             clamped += 1 if code > 255.0 else 0
-            code = code if code > 0.0 else 0.0
-            rows[k, j] = code if code < 255.0 else 255.0
+            code = max(0.0, code)
+            rows[k, j] = min(255.0, code)
     counts[COLORS] += clamped
 
     clamped, flattened = 0, 0
@@ -134,8 +134,8 @@ def pack_lanes(rows, halves, ranges, words, counts):
             is_clamped = (code < 1.0) | (code > 255.0)
             flattened += 1 if is_flat & (ln_scale > -np.inf) else 0
             clamped += 1 if is_clamped & (not is_flat) else 0
-            code = code if code > 1.0 else 1.0
-            code = code if code < 255.0 else 255.0
+            code = max(1.0, code)
+            code = min(255.0, code)
             rows[k, j] = 0.0 if is_flat else code
     counts[SCALES] += clamped
     counts[FLATTENED] += flattened
@@ -150,7 +150,9 @@ def pack_lanes(rows, halves, ranges, words, counts):
             | (np.uint32(np.int32(rows[OPACITY, j])) << np.uint32(24))
         )
         words[j, 1] = x | (y << np.uint32(16))
-        words[j, 2] = z | (np.uint32(np.int32(rows[X, j])) << np.uint32(16)) | (np.uint32(np.int32(rows[Y, j])) << np.uint32(24))
+        words[j, 2] = (
+            z | (np.uint32(np.int32(rows[X, j])) << np.uint32(16)) | (np.uint32(np.int32(rows[Y, j])) << np.uint32(24))
+        )
         words[j, 3] = (
             np.uint32(np.int32(rows[LN, j]))
             | (np.uint32(np.int32(rows[LN + 1, j])) << np.uint32(8))
@@ -201,7 +203,7 @@ def pack_rotations(rows):
         rows[Y, j] = below_v + 1.0 if v - below_v >= 0.5 else below_v
         rows[W, j] = w
         # Rounding can leave w just above 1, where the original's angle is not a number and its code 0.
-        w = w if w < 1.0 else 1.0
+        w = min(1.0, w)
         angle = _ACOS[7]
         for k in range(6, -1, -1):
             angle = angle * w + _ACOS[k]

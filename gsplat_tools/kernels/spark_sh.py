@@ -49,8 +49,8 @@ def encode_band(rest, first, scale, then, limit, bits, num_values, packed, count
                 below = np.floor(value)
                 code = below + 1.0 if value - below >= 0.5 else below
                 clamped += 1 if abs(code) > limit else 0
-                code = code if code > -limit else -limit
-                code = code if code < limit else limit
+                code = max(-limit, code)
+                code = min(limit, code)
                 codes[j] = np.uint32(np.int32(code)) & mask
             place = v * bits
             word, shift = place >> 5, np.uint32(place & 31)
