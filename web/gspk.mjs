@@ -13,6 +13,7 @@
 const VERSION = 1;
 const HEADER_BYTES = 64;
 const ALIGNMENT = 64;
+const LAYOUTS = ["spark", "uncompressed"];
 const MAX_JSON_BYTES = 64 * 2 ** 20;
 const MAX_RATIO = 1024; // decoded bytes for each byte of the file
 
@@ -165,7 +166,7 @@ function readDescription(bytes) {
   if (offset + jsonLength > length) {
     throw new GspkError(`the description ends at byte ${offset + jsonLength} of ${length}`, { field: "json_length", offset: 24 });
   }
-  for (let i = 36; i < HEADER_BYTES; i++) {
+  for (let i = 40; i < HEADER_BYTES; i++) {
     if (bytes[i] !== 0) throw new GspkError(`expected 0, found ${bytes[i]}`, { field: "reserved", offset: i });
   }
   const text = bytes.subarray(offset, offset + jsonLength);
@@ -176,7 +177,12 @@ function readDescription(bytes) {
   } catch (cause) {
     throw new GspkError(`the description is no JSON: ${cause.message}`, { field: "description", offset, cause });
   }
-  return { description, parts: checkDescription(description, offset), text: { name: "description", offset, stored_length: jsonLength } };
+  const parts = checkDescription(description, offset);
+  const layout = view.getUint32(36, true);
+  if (LAYOUTS[layout] !== description.layout) {
+    throw new GspkError(`${layout} does not stand for the description's layout ${description.layout}`, { field: "layout", offset: 36 });
+  }
+  return { description, parts, text: { name: "description", offset, stored_length: jsonLength } };
 }
 
 /** Check what concerns the whole file and return the streams by name. */
@@ -184,7 +190,7 @@ function checkDescription(description, offset) {
   const wrong = (field, message) => new GspkError(message, { field, offset });
   if (description === null || typeof description !== "object") throw wrong("description", "expected an object");
   const { layout, count, degree, frame_rows: frameRows, streams } = description;
-  if (layout !== "spark" && layout !== "uncompressed") throw wrong("layout", `expected spark or uncompressed, found ${JSON.stringify(layout)}`);
+  if (!LAYOUTS.includes(layout)) throw wrong("layout", `expected ${LAYOUTS.join(" or ")}, found ${JSON.stringify(layout)}`);
   if (!isCount(count)) throw wrong("count", `expected a count, found ${JSON.stringify(count)}`);
   if (!isCount(degree) || degree > 4) throw wrong("degree", `expected 0 to 4, found ${JSON.stringify(degree)}`);
   if (!isCount(frameRows) || frameRows < 1) throw wrong("frame_rows", `expected at least 1, found ${JSON.stringify(frameRows)}`);

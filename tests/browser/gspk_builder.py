@@ -59,7 +59,8 @@ def assemble(content: Mapping[str, Any], body: bytes, place: int) -> bytes:
     """Return a file with this description, and `body` from byte `place` on."""
     text = json.dumps(content).encode()
     padding = b"\0" * (place - ALIGNMENT - len(text))
-    header = struct.pack("<4sIQQQI28x", b"GSPK", 1, place + len(body), ALIGNMENT, len(text), zlib.crc32(text))
+    layout = int(content["layout"] == "uncompressed")
+    header = struct.pack("<4sIQQQII24x", b"GSPK", 1, place + len(body), ALIGNMENT, len(text), zlib.crc32(text), layout)
     return header + text + padding + body
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.formats.pack.spark import SparkPack
 from tests.browser.chromium import Chromium
 
 TEXTURE_WIDTH = 2048
@@ -79,6 +81,14 @@ def draw_with_spark(
     return to_image(pixels, camera)
 
 
+def draw_pack(
+    browser: Chromium, camera: PinholeCamera, pack: SparkPack, *, options: Mapping[str, Any] | None = None
+) -> NDArray[np.uint8]:
+    """Draw what the package encoded, with the ranges that it encoded with."""
+    encoding = {name: value for name, value in pack.encoding.to_json().items() if name != "sh4Max"}
+    return draw_with_spark(browser, camera, pack.packed, pack.sh1, pack.sh2, pack.sh3, encoding=encoding, options=options)
+
+
 def scene_settings(
     camera: PinholeCamera,
     *,
@@ -103,3 +113,9 @@ def scene_settings(
 def to_image(pixels: bytes, camera: PinholeCamera) -> NDArray[np.uint8]:
     """Return the pixels of a drawing job as an array with the top row first."""
     return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, 4)[::-1].copy()
+
+
+def psnr(pixels: NDArray[np.uint8], image: NDArray[Any]) -> float:
+    """Return the PSNR in dB of an image (H, W, 3), 0..1, against the bytes of a canvas (H, W, 4)."""
+    error = float(np.mean((pixels[..., :3] / 255 - np.clip(image, 0, 1)) ** 2))
+    return math.inf if error == 0 else -10 * math.log10(error)

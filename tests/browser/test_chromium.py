@@ -9,8 +9,8 @@ from gsplat_tools.reference.camera import Camera
 from gsplat_tools.reference.models import find_model
 from tests.browser import chromium, conftest
 from tests.browser.chromium import BrowserError
+from tests.browser.scenes import looking_at_origin
 from tests.browser.spark_renderer import draw_with_spark
-from tests.browser.views import looking_at_origin
 
 
 def round_splats(centers, scale_byte, colors):

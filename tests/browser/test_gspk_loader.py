@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import zstandard
 
+import gsplat_tools
+from gsplat_tools.formats.pack import spark
+from gsplat_tools.reference.rasterizer import render
 from tests.browser.chromium import BrowserError
 from tests.browser.gspk_builder import build_gspk, change_description, make_words
-from tests.browser.spark_renderer import TEXTURE_WIDTH, draw_with_spark, scene_settings, to_image
-from tests.browser.views import looking_at_origin
+from tests.browser.scenes import looking_at_origin, make_scene
+from tests.browser.spark_renderer import TEXTURE_WIDTH, draw_pack, draw_with_spark, psnr, scene_settings, to_image
 
 pytestmark = pytest.mark.browser
 
@@ -144,6 +147,40 @@ def test_draw_gspk__draws_the_pixels_of_the_arrays_themselves(browser, codec, en
     assert not np.array_equal(drawn, draw_with_spark(browser, camera, words["packed"], encoding=encoding))
 
 
+@pytest.mark.parametrize("spark_encoding", ["default", "fit"])
+@pytest.mark.parametrize("codec", ["zstd", "none"])
+def test_draw_gspk__draws_files_of_the_package_as_their_words_and_as_the_model(browser, tmp_path, codec, spark_encoding):
+    cloud = make_scene(3)
+    encoding = spark.fit_encoding([cloud]) if spark_encoding == "fit" else spark.SplatEncoding()
+    camera = looking_at_origin(320, 200)
+
+    path = tmp_path / "scene.gspk"
+    gsplat_tools.save(cloud, path, codec=codec, spark_encoding=spark_encoding, rotation="reference", order="none")
+    report, pixels = browser.call("drawGspk", scene_settings(camera), file=path.read_bytes())
+    pack = spark.encode(cloud, encoding=encoding, rotation="reference")
+
+    drawn = to_image(pixels, camera)
+    assert (report["numSplats"], report["numSh"]) == (len(cloud), 3)
+    assert np.array_equal(drawn, draw_pack(browser, camera, pack))
+    ours = render(gsplat_tools.load(path), camera, model="spark", framebuffer="unorm8")
+    assert psnr(drawn, ours.image) >= 50.0
+
+
+@pytest.mark.parametrize("codec", ["zstd", "none"])
+def test_read_gspk__reads_the_uncompressed_files_of_the_package(browser, tmp_path, codec):
+    cloud = make_scene(4)
+    path = tmp_path / "scene.gspk"
+    gsplat_tools.save(cloud, path, to="uncompressed", codec=codec, order="none")
+
+    file = path.read_bytes()
+
+    report, positions = browser.call("readGspk", {"array": "positions"}, file=file)
+    _, shs = browser.call("readGspk", {"array": "shs"}, file=file)
+    assert (report["layout"], report["count"], report["degree"]) == ("uncompressed", len(cloud), 4)
+    assert positions == cloud.means.tobytes()
+    assert shs == cloud.shN.tobytes()
+
+
 def test_draw_gspk__refuses_the_uncompressed_layout_and_says_what_to_do(browser):
     file = build_gspk(uncompressed_arrays(np.random.default_rng(0), 3, 0), layout="uncompressed")
 
@@ -175,6 +212,7 @@ DAMAGED = {
     "json too long": (put(28, b"\1"), "json_length", 24, "at most"),
     "beyond 2^53": (put(23, b"\1"), "json_offset", 16, "beyond 2"),
     "reserved": (put(50, b"\7"), "reserved", 50, "expected 0, found 7"),
+    "layout in the header": (put(36, b"\1"), "layout", 36, "1 does not stand for the description's layout spark"),
     "json checksum": (put(70, b"\0"), "json_crc32", 32, "the bytes are damaged"),
     "layout": (replace(layout="ksplat"), "layout", 64, 'found "ksplat"'),
     "count": (replace(count=-1), "count", 64, "found -1"),
