@@ -21,6 +21,7 @@ const MAX_RATIO = 1024; // decoded bytes for each byte of the file
 const TEXTURE_WIDTH = 2048;
 const TEXTURE_LAYER = 2048 * 2048;
 
+// prettier-ignore
 const DEFAULT_ENCODING = {
   rgbMin: 0, rgbMax: 1, lnScaleMin: -12, lnScaleMax: 9, sh1Max: 1, sh2Max: 1, sh3Max: 1, sh4Max: 1,
 };
@@ -74,16 +75,17 @@ export async function readGspk(source, { decompress, verify = true } = {}) {
   const motion = Object.keys(MOTION).some((name) => parts.has(name));
   const expected = expectedStreams(layout, degree, motion);
 
+  const wrong = (message) => new GspkError(message, { field: "streams" });
   let decodedBytes = 0;
   for (const [name, [dtype, ...rest]] of Object.entries(expected)) {
     const stream = parts.get(name);
-    if (!stream) throw new GspkError(`layout ${layout}, degree ${degree} needs a stream ${name}, and the file has none`, { field: "streams" });
+    if (!stream) throw wrong(`layout ${layout}, degree ${degree} needs a stream ${name}, and the file has none`);
     checkStream(stream, { dtype, shape: [count, ...rest], bytes, frameRows: description.frame_rows });
     decodedBytes += stream.raw_length;
   }
   checkApart([text, ...Object.keys(expected).map((name) => parts.get(name))]);
   if (decodedBytes > MAX_RATIO * bytes.length) {
-    throw new GspkError(`the file claims ${decodedBytes} decoded bytes, more than ${MAX_RATIO} times its ${bytes.length} bytes`, { field: "streams" });
+    throw wrong(`the file claims ${decodedBytes} decoded bytes, more than ${MAX_RATIO} times its ${bytes.length} bytes`);
   }
 
   const arrays = {};
@@ -100,13 +102,18 @@ export async function readGspk(source, { decompress, verify = true } = {}) {
     origin: description.origin ?? [0, 0, 0],
     coordinateSystem: description.coordinate_system ?? "unknown",
     splatModel: description.splat_model ?? "default",
-    motion: motion ? { velocities: arrays.velocities, times: arrays.times, durations: arrays.durations, timeModel: description.time_model } : null,
+    motion: null,
     description,
   };
+  if (motion) {
+    const { velocities, times, durations } = arrays;
+    pack.motion = { velocities, times, durations, timeModel: description.time_model };
+  }
   if (layout === "spark") {
     const { packed, sh1, sh2, sh3, sh4 } = arrays;
     const extra = Object.fromEntries(Object.entries({ sh1, sh2, sh3 }).filter(([, words]) => words));
-    Object.assign(pack, { numSplats: count, packedArray: packed, extra, splatEncoding: readEncoding(description) }, sh4 ? { sh4 } : {});
+    const splatEncoding = readEncoding(description);
+    Object.assign(pack, { numSplats: count, packedArray: packed, extra, splatEncoding }, sh4 ? { sh4 } : {});
   } else {
     const { positions, colors, scales, rotations, shs } = arrays;
     Object.assign(pack, { positions, colors, scales, rotations }, shs ? { shs } : {});
@@ -122,7 +129,9 @@ export async function readGspk(source, { decompress, verify = true } = {}) {
  */
 export function toPackedSplats(spark, pack) {
   if (pack.layout !== "spark") {
-    throw new Error(`PackedSplats takes layout spark, this pack has layout ${pack.layout}: write it with gsplat-convert --to spark`);
+    throw new Error(
+      `PackedSplats takes layout spark, this pack has layout ${pack.layout}: write it with gsplat-convert --to spark`,
+    );
   }
   const { packedArray, numSplats, extra, splatEncoding } = pack;
   return new spark.PackedSplats({ packedArray, numSplats, extra: { ...extra }, splatEncoding });
@@ -149,40 +158,44 @@ export function paddedCount(count) {
 function readDescription(bytes) {
   const { length } = bytes;
   const view = new DataView(bytes.buffer, bytes.byteOffset, length);
+  const wrong = (field, offset, message) => new GspkError(message, { field, offset });
+  const readU64 = (at, field) => {
+    const value = Number(view.getBigUint64(at, true));
+    if (!Number.isSafeInteger(value)) throw wrong(field, at, `${value} is beyond 2^53`);
+    return value;
+  };
   if (length < 4 || String.fromCharCode(...bytes.subarray(0, 4)) !== "GSPK") {
-    throw new GspkError("the file does not start with GSPK: it is no .gspk pack", { field: "magic", offset: 0 });
+    throw wrong("magic", 0, "the file does not start with GSPK: it is no .gspk pack");
   }
-  if (length < HEADER_BYTES) throw new GspkError(`the header has ${HEADER_BYTES} bytes, the file only ${length}`, { field: "header", offset: 0 });
+  if (length < HEADER_BYTES) throw wrong("header", 0, `the header has ${HEADER_BYTES} bytes, the file only ${length}`);
   const version = view.getUint32(4, true);
-  if (version !== VERSION) throw new GspkError(`version ${version} is not read here, only ${VERSION}`, { field: "version", offset: 4 });
-  const fileLength = readU64(view, 8, "file_length");
+  if (version !== VERSION) throw wrong("version", 4, `version ${version} is not read here, only ${VERSION}`);
+  const fileLength = readU64(8, "file_length");
   if (fileLength !== length) {
-    throw new GspkError(`the header promises ${fileLength} bytes, the file has ${length}`, { field: "file_length", offset: 8 });
+    throw wrong("file_length", 8, `the header promises ${fileLength} bytes, the file has ${length}`);
   }
-  const offset = readU64(view, 16, "json_offset");
-  const jsonLength = readU64(view, 24, "json_length");
-  if (offset < HEADER_BYTES) throw new GspkError(`expected at least ${HEADER_BYTES}, found ${offset}`, { field: "json_offset", offset: 16 });
-  if (jsonLength > MAX_JSON_BYTES) throw new GspkError(`at most ${MAX_JSON_BYTES} bytes are read, found ${jsonLength}`, { field: "json_length", offset: 24 });
-  if (offset + jsonLength > length) {
-    throw new GspkError(`the description ends at byte ${offset + jsonLength} of ${length}`, { field: "json_length", offset: 24 });
-  }
+  const offset = readU64(16, "json_offset");
+  const size = readU64(24, "json_length");
+  if (offset < HEADER_BYTES) throw wrong("json_offset", 16, `expected at least ${HEADER_BYTES}, found ${offset}`);
+  if (size > MAX_JSON_BYTES) throw wrong("json_length", 24, `at most ${MAX_JSON_BYTES} bytes are read, found ${size}`);
+  if (offset + size > length) throw wrong("json_length", 24, `the description ends at byte ${offset + size} of ${length}`);
   for (let i = 40; i < HEADER_BYTES; i++) {
-    if (bytes[i] !== 0) throw new GspkError(`expected 0, found ${bytes[i]}`, { field: "reserved", offset: i });
+    if (bytes[i] !== 0) throw wrong("reserved", i, `expected 0, found ${bytes[i]}`);
   }
-  const text = bytes.subarray(offset, offset + jsonLength);
-  checkCrc(text, view.getUint32(32, true), { field: "json_crc32", offset: 32 });
+  const json = bytes.subarray(offset, offset + size);
+  checkCrc(json, view.getUint32(32, true), { field: "json_crc32", offset: 32 });
   let description;
   try {
-    description = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text));
+    description = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
   } catch (cause) {
     throw new GspkError(`the description is no JSON: ${cause.message}`, { field: "description", offset, cause });
   }
   const parts = checkDescription(description, offset);
   const layout = view.getUint32(36, true);
   if (LAYOUTS[layout] !== description.layout) {
-    throw new GspkError(`${layout} does not stand for the description's layout ${description.layout}`, { field: "layout", offset: 36 });
+    throw wrong("layout", 36, `${layout} does not stand for the description's layout ${description.layout}`);
   }
-  return { description, parts, text: { name: "description", offset, stored_length: jsonLength } };
+  return { description, parts, text: { name: "description", offset, stored_length: size } };
 }
 
 /** Check what concerns the whole file and return the streams by name. */
@@ -193,7 +206,8 @@ function checkDescription(description, offset) {
   if (!LAYOUTS.includes(layout)) throw wrong("layout", `expected ${LAYOUTS.join(" or ")}, found ${JSON.stringify(layout)}`);
   if (!isCount(count)) throw wrong("count", `expected a count, found ${JSON.stringify(count)}`);
   if (!isCount(degree) || degree > 4) throw wrong("degree", `expected 0 to 4, found ${JSON.stringify(degree)}`);
-  if (!isCount(frameRows) || frameRows < 1) throw wrong("frame_rows", `expected at least 1, found ${JSON.stringify(frameRows)}`);
+  if (!isCount(frameRows) || frameRows < 1)
+    throw wrong("frame_rows", `expected at least 1, found ${JSON.stringify(frameRows)}`);
   if (!Array.isArray(streams)) throw wrong("streams", "expected a list");
   const parts = new Map();
   for (const stream of streams) {
@@ -208,7 +222,13 @@ function expectedStreams(layout, degree, motion) {
   const expected =
     layout === "spark"
       ? { packed: ["u32", 4], sh1: ["u32", 2], sh2: ["u32", 4], sh3: ["u32", 4], sh4: ["u32", 4] }
-      : { positions: ["f32", 3], colors: ["f32", 4], scales: ["f32", 3], rotations: ["f32", 4], shs: ["f32", (degree + 1) ** 2 - 1, 3] };
+      : {
+          positions: ["f32", 3],
+          colors: ["f32", 4],
+          scales: ["f32", 3],
+          rotations: ["f32", 4],
+          shs: ["f32", (degree + 1) ** 2 - 1, 3],
+        };
   for (const name of ["sh1", "sh2", "sh3", "sh4"]) {
     if (degree < Number(name[2])) delete expected[name];
   }
@@ -239,7 +259,8 @@ function checkStream(stream, { dtype, shape, bytes, frameRows }) {
   }
   const sum = frames.reduce((total, length) => total + length, 0);
   if (sum !== stored) throw wrong(`the frames add up to ${sum} bytes, stored_length is ${stored}`);
-  if (!Array.isArray(sums) || sums.length !== numFrames) throw wrong(`expected ${numFrames} checksums, found ${JSON.stringify(sums?.length)}`);
+  if (!Array.isArray(sums) || sums.length !== numFrames)
+    throw wrong(`expected ${numFrames} checksums, found ${JSON.stringify(sums?.length)}`);
 }
 
 function checkApart(stretches) {
@@ -259,7 +280,10 @@ async function readStream(stream, { bytes, rows, dtype, description, decompress,
   const rowBytes = count === 0 ? 4 * stream.shape.slice(1).reduce((product, length) => product * length, 1) : raw / count;
   const stored = bytes.subarray(stream.offset, stream.offset + stream.stored_length);
   if (codec === "zstd" && raw > 0 && !decompress) {
-    throw new GspkError("the stream is compressed: pass a `decompress` for Zstandard frames, such as fzstd's", { field, offset: stream.offset });
+    throw new GspkError("the stream is compressed: pass a `decompress` for Zstandard frames, such as fzstd's", {
+      field,
+      offset: stream.offset,
+    });
   }
   const isUsableAsItIs = codec === "none" && rows === count && stored.byteOffset % 4 === 0;
   const target = isUsableAsItIs ? stored : new Uint8Array(rows * rowBytes);
@@ -317,10 +341,13 @@ function readEncoding(description) {
   const found = { ...DEFAULT_ENCODING, ...description.splat_encoding };
   const { sh4Max, ...encoding } = Object.fromEntries(Object.keys(DEFAULT_ENCODING).map((name) => [name, found[name]]));
   for (const [name, value] of Object.entries({ ...encoding, sh4Max })) {
-    if (!Number.isFinite(value)) throw new GspkError(`expected a number, found ${JSON.stringify(value)}`, { field: `splat_encoding.${name}` });
+    if (!Number.isFinite(value))
+      throw new GspkError(`expected a number, found ${JSON.stringify(value)}`, { field: `splat_encoding.${name}` });
   }
-  if (encoding.rgbMax <= encoding.rgbMin) throw new GspkError("rgbMax must be above rgbMin", { field: "splat_encoding.rgbMax" });
-  if (encoding.lnScaleMax <= encoding.lnScaleMin) throw new GspkError("lnScaleMax must be above lnScaleMin", { field: "splat_encoding.lnScaleMax" });
+  if (encoding.rgbMax <= encoding.rgbMin)
+    throw new GspkError("rgbMax must be above rgbMin", { field: "splat_encoding.rgbMax" });
+  if (encoding.lnScaleMax <= encoding.lnScaleMin)
+    throw new GspkError("lnScaleMax must be above lnScaleMin", { field: "splat_encoding.lnScaleMax" });
   return encoding;
 }
 
@@ -328,17 +355,14 @@ function isCount(value) {
   return Number.isSafeInteger(value) && value >= 0;
 }
 
-function readU64(view, offset, field) {
-  const value = Number(view.getBigUint64(offset, true));
-  if (!Number.isSafeInteger(value)) throw new GspkError(`${value} is beyond 2^53`, { field, offset });
-  return value;
-}
-
 function checkCrc(bytes, expected, { field, offset }) {
   const found = crc32(bytes);
   if (found !== expected) {
     const hex = (value) => (Number.isInteger(value) ? `0x${value.toString(16).padStart(8, "0")}` : JSON.stringify(value));
-    throw new GspkError(`the checksum is ${hex(found)}, the file says ${hex(expected)}: the bytes are damaged`, { field, offset });
+    throw new GspkError(`the checksum is ${hex(found)}, the file says ${hex(expected)}: the bytes are damaged`, {
+      field,
+      offset,
+    });
   }
 }
 

@@ -33,10 +33,14 @@ export async function readGspk({ array, withoutDecompressor = false, options = {
   const find = (path) => path.split(".").reduce((value, key) => value?.[key], pack);
   const found = array ? find(array) : new Uint8Array();
   if (!ArrayBuffer.isView(found)) throw new Error(`the pack has no array ${array}`);
-  const describe = (value) => (ArrayBuffer.isView(value) ? { type: value.constructor.name, length: value.length, isView: value.buffer === file } : value);
-  const report = Object.fromEntries(Object.entries(pack).map(([key, value]) => [key, describe(value)]));
-  report.extra = Object.fromEntries(Object.entries(pack.extra ?? {}).map(([key, value]) => [key, describe(value)]));
-  if (pack.motion) report.motion = Object.fromEntries(Object.entries(pack.motion).map(([key, value]) => [key, describe(value)]));
+  const describe = (value) =>
+    ArrayBuffer.isView(value) ? { type: value.constructor.name, length: value.length, isView: value.buffer === file } : value;
+  const describeAll = (values) => Object.fromEntries(Object.entries(values).map(([key, value]) => [key, describe(value)]));
+  const report = {
+    ...describeAll(pack),
+    extra: describeAll(pack.extra ?? {}),
+    motion: pack.motion && describeAll(pack.motion),
+  };
   return { report, bytes: new Uint8Array(found.buffer, found.byteOffset, found.byteLength) };
 }
 
@@ -93,7 +97,10 @@ async function draw(mesh, { camera: given, options, background }) {
     const error = gl.getError();
     if (error !== gl.NO_ERROR) throw new Error(`WebGL error ${error}`);
     const { numSplats, splatEncoding } = mesh.packedSplats;
-    return { report: { numSplats, splatEncoding, numSh: mesh.packedSplats.getNumSh(), activeSplats: sparkRenderer.activeSplats }, bytes };
+    return {
+      report: { numSplats, splatEncoding, numSh: mesh.packedSplats.getNumSh(), activeSplats: sparkRenderer.activeSplats },
+      bytes,
+    };
   } finally {
     scene.remove(sparkRenderer, mesh);
     mesh.dispose();
@@ -116,10 +123,12 @@ function toThreeCamera({ viewmat, K, width, height, near, far }) {
   const camera = new THREE.PerspectiveCamera(45, width / height, near, far);
   const flip = new THREE.Matrix4().makeScale(1, -1, -1);
   camera.matrixAutoUpdate = false;
+  // prettier-ignore
   camera.matrix.set(...viewmat).premultiply(flip).invert();
   camera.updateMatrixWorld(true);
   const [fx, , cx, , fy, cy] = K;
   const depth = far - near;
+  // prettier-ignore
   camera.projectionMatrix.set(
     (2 * fx) / width, 0, 1 - (2 * cx) / width, 0,
     0, (2 * fy) / height, (2 * cy) / height - 1, 0,
