@@ -23,20 +23,20 @@ ALPHA_CAP = 6
 ALPHA_FLOOR = 7  # fragments below are skipped
 CUTOFF = 8  # fragments beyond this q are skipped; q = d^2 / 2, d in standard deviations
 GAIN, OFFSET = 9, 10  # falloff = gain exp(-q) - offset
-EDGE_START, EDGE_SLOPE = 11, 12  # less exp((m - start) slope), m = max(abs u, abs v) at the unit quad
-SCALE_FACTOR = 13  # of the quad
-COMPENSATION_FLOOR = 14  # least ratio of determinants under the root
-COLOR_FLOOR = 15
-BRIGHTNESS = 16
-STOP = 17  # a pixel is finished before its transmittance falls below
-ROUNDING = 18  # 1.5 * 2^(bits of the mantissa): adding and subtracting it rounds to an integer
-RULES_SIZE = 19
+EDGE_GAIN, EDGE_START, EDGE_SLOPE = 11, 12, 13  # less gain exp((m - start) slope), m = max(abs u, abs v) at the unit quad
+SCALE_FACTOR = 14  # of the quad
+COMPENSATION_FLOOR = 15  # least ratio of determinants under the root
+COLOR_FLOOR = 16
+BRIGHTNESS = 17
+STOP = 18  # a pixel is finished before its transmittance falls below
+ROUNDING = 19  # 1.5 * 2^(bits of the mantissa): adding and subtracting it rounds to an integer
+RULES_SIZE = 20
 
 # CHOICES: a model's alternatives
 COMPENSATION = 0
 FOOTPRINT = 1
 AXES = 2
-HAS_EDGE = 3  # falloff and quad are evaluated in the splat's axes
+IN_AXES = 3  # falloff and quad are evaluated in the splat's axes
 GAMMA = 4  # colors are turned from gamma to linear
 IS_FRONT_TO_BACK = 5
 IS_QUANTIZED = 6  # framebuffer of 8 bits

@@ -245,7 +245,7 @@ def rule_array(model: Model, camera: Camera, dtype: DTypeLike, *, scale_factor: 
 
     caps = {"viewport": min(1024.0, camera.width, camera.height), None: math.inf}
     cap = model.axis_cap if isinstance(model.axis_cap, float) else caps[model.axis_cap]
-    edge_start, edge_slope = model.edge if model.edge is not None else (0.0, 0.0)
+    edge_gain, edge_start, edge_slope = (0.0, 0.0, 0.0) if model.edge is None else (1.0, *model.edge)
     rules = np.empty(R.RULES_SIZE, np.float64)
     rules[R.LOW_PASS] = model.low_pass
     rules[R.SLOPE_LIMIT] = model.slope_limit
@@ -257,7 +257,7 @@ def rule_array(model: Model, camera: Camera, dtype: DTypeLike, *, scale_factor: 
     rules[[R.ALPHA_CAP, R.ALPHA_FLOOR]] = model.alpha_cap, model.alpha_floor
     rules[R.CUTOFF] = model.cutoff
     rules[[R.GAIN, R.OFFSET]] = model.gain, model.offset
-    rules[[R.EDGE_START, R.EDGE_SLOPE]] = edge_start * scale_factor, edge_slope * scale_factor
+    rules[[R.EDGE_GAIN, R.EDGE_START, R.EDGE_SLOPE]] = edge_gain, edge_start * scale_factor, edge_slope * scale_factor
     rules[R.SCALE_FACTOR] = scale_factor
     rules[R.COMPENSATION_FLOOR] = model.compensation_floor
     rules[R.COLOR_FLOOR] = -math.inf if model.color_floor is None else model.color_floor
@@ -280,7 +280,7 @@ def choice_array(model: Model, *, scale_factor: float, gamma_to_linear: bool, qu
     choices[R.FOOTPRINT] = R.FOOTPRINT_TILES if model.tile_footprint else R.FOOTPRINT_ELLIPSE
     choices[R.AXES] = R.AXES_UNDEFINED if model.undefined_axes else R.AXES_ALIGNED if model.aligns_axes else R.AXES_EXACT
     # At scale factor 1 the quad cuts only what lies below the floor of alpha.
-    choices[R.HAS_EDGE] = model.edge is not None or (model.name == "unity" and scale_factor < 1)
+    choices[R.IN_AXES] = model.edge is not None or (model.name == "unity" and scale_factor < 1)
     choices[R.GAMMA] = gamma_to_linear
     choices[R.IS_FRONT_TO_BACK] = model.front_to_back
     choices[R.IS_QUANTIZED] = quantizes and not model.front_to_back

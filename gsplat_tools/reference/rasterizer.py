@@ -310,8 +310,7 @@ def _draw_band(
     from gsplat_tools.kernels.tile_binning import TILE_WIDTH, scatter_tiles
 
     records, bounds = projection.records, projection.bounds
-    pitch = planes.shape[2]
-    tiles_x = pitch // TILE_WIDTH
+    tiles_x = planes.shape[2] // TILE_WIDTH
     lists = np.empty(offsets[last] - offsets[first], np.uint32)
     places = positions - offsets[first]
     parallel.run_blocks(
@@ -321,11 +320,9 @@ def _draw_band(
         len(drawing),
         block,
     )
-    grid = np.array([tiles_x, pitch, planes.shape[1] * pitch, first], np.int64)
-    flat = planes.reshape(-1)
     parallel.run_blocks(
         lambda start, stop: blend_tiles(
-            records, bounds, lists, offsets, grid, first + start, first + stop, numbers, choices, flat
+            records, bounds, lists, offsets, first, first + start, first + stop, numbers, choices, planes
         ),
         last - first,
         _TILES_PER_TASK,
