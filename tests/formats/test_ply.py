@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import numpy as np
+import plyfile
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -247,3 +248,19 @@ def test_matches__leaves_the_packed_kind_to_its_own_format():
     assert not ply.FORMAT.matches(packed)
     assert not ply.FORMAT.matches(b"plywood\n")
     assert not ply.FORMAT.matches(b"")
+
+
+@settings(deadline=None, max_examples=40)
+@given(values=st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=4))
+def test_read__parses_text_as_plyfile_does(values):
+    count = len(values)
+    columns = splat_columns(count) | {"x": ("float", values), "wide": ("double", values), "id": ("int", list(range(count)))}
+    data = ply_file(vertex(columns), encoding="ascii")
+    with np.errstate(over="ignore"):
+        expected = plyfile.PlyData.read(io.BytesIO(data))["vertex"]
+
+    cloud = read(data)
+
+    np.testing.assert_array_equal(cloud.means[:, 0], expected["x"])
+    np.testing.assert_array_equal(cloud.extra["wide"], expected["wide"])
+    np.testing.assert_array_equal(cloud.extra["id"], expected["id"])

@@ -6,6 +6,7 @@ import io
 import os
 import threading
 import warnings
+from itertools import islice
 from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
@@ -96,7 +97,8 @@ def open_rows(stream: BinaryIO, header: PlyHeader, vertex: PlyElement) -> Rows:
     """
     if header.encoding == "ascii":
         check_text_claim(header, stream)
-        return ParsedRows(_parse(stream, header, header.elements, header.size))
+        records = _parse_plain_text(stream, header, vertex)
+        return ParsedRows(_parse(stream, header, header.elements, header.size) if records is None else records)
     offset = element_offsets(header, stream)[vertex.name]
     if vertex.has_lists:
         return ParsedRows(_parse(stream, header, (vertex,), offset))
@@ -133,6 +135,22 @@ class _Joined(io.RawIOBase):
             part = self._stream.read(len(buffer))
         buffer[: len(part)] = part
         return len(part)
+
+
+def _parse_plain_text(stream: BinaryIO, header: PlyHeader, vertex: PlyElement) -> NDArray[Any] | None:
+    """Parse scalar rows that end the file, or return None for whatever needs plyfile: its dialects, or its error."""
+    if vertex.count == 0 or vertex.has_lists or any(other.count for other in header.elements if other is not vertex):
+        return None
+    stream.seek(header.size)
+    text = io.TextIOWrapper(io.BufferedReader(_Joined(b"", stream), 1 << 16), "ascii")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            records = np.loadtxt(islice(text, vertex.count), vertex.row_dtype, comments=None, ndmin=1)
+            is_whole = len(records) == vertex.count and not text.read().strip() and _ends_a_line(stream)
+    except (ValueError, OverflowError, Warning):
+        return None
+    return records if is_whole else None
 
 
 def _parse(stream: BinaryIO, header: PlyHeader, elements: tuple[PlyElement, ...], offset: int) -> NDArray[Any]:
