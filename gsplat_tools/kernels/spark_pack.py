@@ -87,7 +87,8 @@ def opacity_code(logit):
     if not place > 0.0:
         return 0.0
     cell = np.int64(min(place, 2.0 * _LOGIT_LIMIT * _CELLS))
-    return _CELL_CODES[cell] + (1.0 if logit >= _CELL_STEPS[cell] else 0.0)
+    # Above the last cell, and at +inf, which is no smaller than its step, the code stays 255.
+    return min(_CELL_CODES[cell] + (1.0 if logit >= _CELL_STEPS[cell] else 0.0), 255.0)
 
 
 @device()

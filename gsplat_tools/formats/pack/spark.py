@@ -16,10 +16,10 @@ from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.pack import gspk, words
 from gsplat_tools.formats.pack.container_writing import Codec, Rows
 from gsplat_tools.formats.pack.encoding import SplatEncoding, fit_encoding
-from gsplat_tools.formats.pack.words import Rotation, SparkPack, decode, encode
+from gsplat_tools.formats.pack.words import Rotation, SparkPack, decode, encode, encode_values
 from gsplat_tools.sequence import GaussianSequence
 
-__all__ = ["FORMAT", "SparkOptions", "SparkPack", "SplatEncoding", "decode", "encode", "fit_encoding", "write"]
+__all__ = ["FORMAT", "SparkOptions", "SparkPack", "SplatEncoding", "decode", "encode", "encode_values", "fit_encoding", "write"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +111,7 @@ FORMAT = Format(
     presets={
         "fast": {"rotation": "reference", "zstd_level": 1},
         "balanced": {},
-        "best": {"spark_encoding": "fit", "zstd_level": 19},
+        "best": {"spark_encoding": "fit", "zstd_level": 12},
     },
     model=("unity", None),
 )

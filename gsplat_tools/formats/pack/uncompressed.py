@@ -79,6 +79,6 @@ FORMAT = Format(
     stores_splat_model=True,
     streams=True,
     write_options=UncompressedOptions,
-    presets={"fast": {"zstd_level": 1}, "balanced": {}, "best": {"zstd_level": 19}},
+    presets={"fast": {"zstd_level": 1}, "balanced": {}, "best": {"zstd_level": 12}},
     model=("unity", None),
 )

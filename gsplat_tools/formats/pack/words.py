@@ -186,7 +186,7 @@ def encode_rows(cloud: GaussianCloud, encoding: SplatEncoding, rotation: Rotatio
     count = len(cloud)
     frames = choose_frames(cloud, encoding, rotation)
     ranges = np.array([encoding.rgb_min, encoding.rgb_max, encoding.ln_scale_min, encoding.ln_scale_max])
-    rest = cloud.shN.reshape(count, -1)
+    rest = cloud.shN.reshape(count, 3 * cloud.shN.shape[1])
     rows = {"packed": np.empty((count, 4), np.uint32)}
     for band in range(1, cloud.sh_degree + 1):
         rows[f"sh{band}"] = np.empty((count, SH_WORDS[band]), np.uint32)
@@ -231,6 +231,43 @@ def encode_band(
     # Spark multiplies bands 1 and 3 by limit / max, band 2 by 1 / max and then by limit: the bits can differ.
     scale, then = (1.0 / encoding.sh_max(band), limit) if band == 2 else (limit / encoding.sh_max(band), 1.0)
     spark_sh.encode_band(rest, first, scale, then, limit, SH_BITS[band], 3 * (2 * band + 1), packed, counts)
+
+
+def encode_values(
+    means: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    encoding: SplatEncoding | None = None,
+) -> Words:
+    """Return the 16 bytes of splats whose values are activated already, as Spark's own encoder takes them.
+
+    Parameters
+    ----------
+    means, scales, quats, opacities, colors
+        (N, 3), (N, 3) linear, (N, 4) wxyz, (N,), (N, 3). Beyond the range of half a position becomes infinite, anything
+        else is clamped; nothing is counted.
+    encoding
+        Ranges of the quantized fields; Spark's defaults where None.
+
+    Returns
+    -------
+    Words
+        (N, 4) u32.
+    """
+    from gsplat_tools.kernels import spark_pack
+
+    encoding = encoding if encoding is not None else SplatEncoding()
+    wide = np.asarray(scales, np.float64)
+    with np.errstate(divide="ignore", over="ignore"):
+        ln_scales = np.where(wide < np.exp(FLAT_LN_SCALE), -np.inf, np.log(wide))
+        halves = np.asarray(means, np.float32).astype(np.float16).view(np.uint16)
+    packed = np.empty((len(halves), 4), np.uint32)
+    ranges = np.array([encoding.rgb_min, encoding.rgb_max, encoding.ln_scale_min, encoding.ln_scale_max])
+    values = [np.ascontiguousarray(array, np.float64) for array in (ln_scales, quats, opacities, colors)]
+    spark_pack.encode_values(halves, *values, ranges, packed, np.zeros(spark_pack.NUM_COUNTS, np.int64))
+    return packed
 
 
 def encode(cloud: GaussianCloud, *, encoding: SplatEncoding | None = None, rotation: Rotation = "reference") -> SparkPack:
@@ -279,7 +316,7 @@ def decode_rows(rows: Mapping[str, NDArray[Any]], encoding: SplatEncoding, targe
     packed = rows["packed"]
     target.means[:] = stored_positions(packed)
     spark_unpack.decode_cloud(packed, *_tables(encoding), target.log_scales, target.quats, target.opacity_logits, target.sh0)
-    rest = target.shN.reshape(len(target), -1)
+    rest = target.shN.reshape(len(target), 3 * target.shN.shape[1])
     for band in range(1, target.sh_degree + 1):
         bits = SH_BITS[band]
         step = encoding.sh_max(band) / ((1 << (bits - 1)) - 1)
