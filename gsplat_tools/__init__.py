@@ -6,6 +6,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from gsplat_tools._version import __version__ as __version__
+
 if TYPE_CHECKING:
     from gsplat_tools import errors
     from gsplat_tools.cloud import GaussianCloud
@@ -16,8 +18,6 @@ if TYPE_CHECKING:
     from gsplat_tools.reference.rasterizer import render
     from gsplat_tools.reference.sorting import sort_by_depth
     from gsplat_tools.sequence import GaussianSequence
-
-__version__ = "0.1.0"
 
 _HOMES = {
     "FORMATS": "gsplat_tools.formats",
