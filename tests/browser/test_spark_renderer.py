@@ -9,6 +9,7 @@ import gsplat_tools
 from gsplat_tools.formats.pack import spark
 from gsplat_tools.reference.camera import Camera
 from gsplat_tools.reference.rasterizer import render
+from gsplat_tools.reference.sorting import sort_by_depth
 from tests.browser.gspk_builder import make_words
 from tests.browser.scenes import looking_at_origin, make_scene
 from tests.browser.spark_renderer import draw_pack, draw_with_spark, psnr
@@ -89,3 +90,21 @@ def test_render__draws_the_bundled_scene_as_the_real_renderer_does(browser, spar
     ours = render(spark.decode(pack), camera, model="spark", framebuffer="unorm8")
 
     assert psnr(pixels, ours.image) >= LEAST_PSNR
+
+
+@pytest.mark.parametrize("metric", ["radial", "depth"])
+def test_render__draws_in_the_order_that_the_real_renderer_sorts_by(browser, metric):
+    pack = spark.encode(make_scene(3))
+    decoded, camera = spark.decode(pack), looking_at_origin(320, 200)
+
+    pixels = draw_pack(browser, camera, pack, options={"sortRadial": metric == "radial"})
+    drawn = {
+        name: render(
+            decoded, camera, model="spark", framebuffer="unorm8", order=sort_by_depth(decoded, camera, metric=name)
+        ).image
+        for name in ("radial", "depth")
+    }
+
+    other = "depth" if metric == "radial" else "radial"
+    assert psnr(pixels, drawn[metric]) >= LEAST_PSNR
+    assert psnr(pixels, drawn[other]) < psnr(pixels, drawn[metric]) - 5
