@@ -240,4 +240,3 @@ def project(splats, lens, rules, choices, first, records, bounds, states):
         if rules[R.ALPHA_FLOOR] > zero:
             clip = min(one, half * np.sqrt(max(zero, np.log(opacity / rules[R.ALPHA_FLOOR]))))
         records[i, R.REC_BOX] = two * clip * rules[R.SCALE_FACTOR]
-        records[i, R.REC_DEPTH] = z

@@ -62,8 +62,7 @@ REC_OPACITY = 6
 REC_R, REC_G, REC_B = 7, 8, 9
 REC_UX, REC_UY, REC_VX, REC_VY = 10, 11, 12, 13
 REC_BOX = 14  # half side of the quad, in units of sqrt(q)
-REC_DEPTH = 15
-RECORD_SIZE = 16
+RECORD_SIZE = 16  # padded to a cache line of float32
 
 # States of a splat after projection
 DRAWN, CULLED, INVALID, HIDDEN = 0, 1, 2, 3

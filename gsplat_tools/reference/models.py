@@ -160,6 +160,8 @@ _SPARK = Model(
     alpha_floor=0.5 / 255.0,
     cutoff=4.0,
     aligns_axes=True,
+    # The vertex shader clamps what the accumulator holds.
+    color_floor=0.0,
     max_sh_degree=3,
     metric="radial",
     accumulator="packed",
@@ -181,6 +183,7 @@ _VISIONARY = Model(
     half_records=True,
     color_floor=0.0,
     max_sh_degree=3,
+    metric="clip",
 )
 
 MODELS: dict[str, dict[str | None, Model]] = {

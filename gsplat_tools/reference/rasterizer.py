@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from gsplat_tools import parallel
 from gsplat_tools.reference import models
 from gsplat_tools.reference.camera import Camera
+from gsplat_tools.reference.cutouts import Cutout, find_survivors
 from gsplat_tools.reference.models import Model
 from gsplat_tools.reference.motion import TEMPORAL_GAUSSIAN_CUTOFF, Scene, SceneState, evaluate_scene
-from gsplat_tools.reference.sorting import checked_order, depth_keys, sort_pairs
+from gsplat_tools.reference.sorting import checked_order, drawing_keys, sort_pairs
 
 Precision = Literal["float32", "float64"]
 Framebuffer = Literal["float", "unorm8"]
@@ -83,7 +84,6 @@ class _Projection:
     records: NDArray[Any]
     bounds: NDArray[np.int32]
     states: NDArray[np.uint8]
-    depths: NDArray[np.float32]
 
 
 def render(
@@ -102,7 +102,7 @@ def render(
     brightness: float = 1.0,
     gamma_to_linear: bool = False,
     antialias: bool | None = None,
-    cutouts: Sequence[Any] = (),
+    cutouts: Sequence[Cutout] = (),
     temporal_cutoff: float = TEMPORAL_GAUSSIAN_CUTOFF,
 ) -> Rendering:
     """Draw a scene as a target would show it.
@@ -173,13 +173,16 @@ def render(
         raise ValueError(f"background must be three finite numbers, got {background!r}")
 
     state = evaluate_scene(scene, t, dtype=dtype, temporal_cutoff=temporal_cutoff)
+    if cutouts:
+        is_kept = find_survivors(state, cutouts)
+        state = replace(state, is_visible=is_kept if state.is_visible is None else is_kept & state.is_visible)
     numbers = models.rule_array(rules, camera, dtype, scale_factor=scale_factor, brightness=brightness)
     choices = models.choice_array(
         rules, scale_factor=scale_factor, gamma_to_linear=gamma_to_linear, quantizes=framebuffer == "unorm8"
     )
     projection = _project(state, camera, rules, numbers, choices, sh_degree)
     named = _named_splats(state, order)
-    drawing = _drawing_order(projection, state, rules, named)
+    drawing = _drawing_order(projection.states, state, camera, rules, named)
     planes = _blend(projection, drawing, camera, numbers, choices, backdrop)
     image, alphas = _compose(planes, camera, rules, backdrop, quantizes=framebuffer == "unorm8")
     return Rendering(image, alphas, _count(projection.states, drawing, state, named), rules)
@@ -211,6 +214,7 @@ def _project(
 ) -> _Projection:
     """Project all splats, block by block."""
     from gsplat_tools.kernels import rules as R
+    from gsplat_tools.kernels.accumulator import EXTENDED, PACKED, requantize
     from gsplat_tools.kernels.projection import activate, project
     from gsplat_tools.kernels.sh_eval import evaluate_colors
 
@@ -220,9 +224,10 @@ def _project(
         records=np.empty((count, R.RECORD_SIZE), dtype),
         bounds=np.empty((count, 4), np.int32),
         states=np.empty(count, np.uint8),
-        depths=np.empty(count, np.float32),
     )
-    lens = models.lens_array(model, camera, cloud.origin, dtype)
+    packs_anew = model.accumulator != "none"
+    # Accumulators hold splats relative to the camera.
+    lens = models.lens_array(model, camera, camera.position if packs_anew else cloud.origin, dtype)
     weights = np.empty(0, dtype) if state.weights is None else state.weights
     eye = (camera.position - cloud.origin).astype(dtype)
     degree = min(cloud.sh_degree, model.max_sh_degree, cloud.sh_degree if sh_degree is None else sh_degree)
@@ -232,6 +237,8 @@ def _project(
         splats = np.empty((stop - start, R.SPLAT_SIZE), dtype)
         activate(means, cloud.log_scales, cloud.quats, cloud.opacity_logits, weights, start, stop, splats)
         evaluate_colors(cloud.sh0, cloud.shN, eye, degree, band_4_first, start, splats)
+        if packs_anew:
+            requantize(splats, eye, PACKED if model.accumulator == "packed" else EXTENDED)
         project(splats, lens, numbers, choices, start, projection.records, projection.bounds, projection.states)
 
     parallel.run_blocks(project_block, count)
@@ -244,19 +251,20 @@ def _named_splats(state: SceneState, order: ArrayLike | None) -> NDArray[np.uint
 
 
 def _drawing_order(
-    projection: _Projection, state: SceneState, model: Model, named: NDArray[np.uint32] | None
+    states: NDArray[np.uint8], state: SceneState, camera: Camera, model: Model, named: NDArray[np.uint32] | None
 ) -> NDArray[np.uint32]:
     """Return the indices of the splats that are drawn, in drawing order."""
     from gsplat_tools.kernels import rules as R
 
-    is_drawn = (projection.states & ~np.uint8(R.EIGENVECTOR_UNDEFINED)) == R.DRAWN
+    is_drawn = (states & ~np.uint8(R.EIGENVECTOR_UNDEFINED)) == R.DRAWN
+    if state.is_visible is not None:
+        is_drawn &= state.is_visible
     if named is not None:
         drawn = named[is_drawn[named]]
         return np.ascontiguousarray(drawn[::-1]) if model.front_to_back else drawn
     indices = np.flatnonzero(is_drawn).astype(np.uint32)
-    depths = projection.records[indices, R.REC_DEPTH].astype(np.float32)
-    keys = depth_keys(depths if model.front_to_back else -depths, None)
-    return sort_pairs(keys, indices)[1] if len(keys) else indices
+    keys = drawing_keys(state, camera, metric=model.metric, far_first=not model.front_to_back)
+    return sort_pairs(keys[indices], indices)[1]
 
 
 def _blend(

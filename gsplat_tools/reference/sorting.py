@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gsplat_tools import parallel
-from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.reference.camera import Camera
-from gsplat_tools.reference.motion import Scene, evaluate_scene
+from gsplat_tools.reference.motion import Scene, SceneState, evaluate_scene
 
-Metric = Literal["depth", "radial"]
+Metric = Literal["depth", "radial", "clip"]
 
 LAST_KEY = 0xFFFFFFFF
 """Key of what is hidden or NaN: sorts last."""
@@ -100,7 +99,8 @@ def sort_by_depth(
     t
         Normalized time; None takes a cloud as it is stored.
     metric
-        "depth" along the view (gsplat-unity, 3DGS, Visionary) or "radial" distance (Spark).
+        "depth" along the view (gsplat-unity, 3DGS), "radial" distance (Spark), or "clip", Visionary's far plane less
+        clip z, which is along the view too but makes neighbours equal where far / near is large.
     order
         (M,) uint32 initial payload, such as the splats that a cutout left; 0..N-1 by default.
 
@@ -122,8 +122,7 @@ def sort_by_depth(
     if metric not in get_args(Metric):
         raise ValueError(f"metric must be one of {get_args(Metric)}, got {metric!r}")
     state = evaluate_scene(scene, t)
-    depths = view_depths(state.cloud, state.means, camera, metric=metric, far_first=True)
-    keys = depth_keys(depths, state.is_visible)
+    keys = drawing_keys(state, camera, metric=metric, far_first=True)
     if order is None:
         return sort_keys(keys)
     order = checked_order(order, len(keys))
@@ -146,34 +145,48 @@ def checked_order(order: ArrayLike, count: int) -> NDArray[np.uint32]:
     return np.ascontiguousarray(indices, np.uint32)
 
 
-def view_depths(
-    cloud: GaussianCloud, means: NDArray[Any], camera: Camera, *, metric: Metric, far_first: bool
-) -> NDArray[np.float32]:
-    """Return the float32 depths (N,) of means in a camera, negated where far splats are to sort first."""
+def drawing_keys(
+    state: SceneState, camera: Camera, *, metric: Metric, far_first: bool, matrix: NDArray[np.float64] | None = None
+) -> NDArray[np.uint32]:
+    """Return keys (N,) that sort ascending into a drawing order; NaN and what is hidden go last.
+
+    A matrix (4, 4) places the scene in the world.
+    """
     from gsplat_tools.kernels.depth_keys import METRIC_DEPTH, METRIC_RADIAL, fill_depths
 
-    view = view_rows(camera, cloud.origin).astype(means.dtype)
+    means = state.means
+    view = view_rows(camera, state.cloud.origin, matrix).astype(means.dtype)
     depths = np.empty(len(means), np.float32)
     kind = METRIC_RADIAL if metric == "radial" else METRIC_DEPTH
-    sign = means.dtype.type(-1 if far_first else 1)
+    sign = means.dtype.type(-1 if far_first and metric != "clip" else 1)
     parallel.run_blocks(lambda start, stop: fill_depths(means, view, kind, sign, start, stop, depths), len(means), _BLOCK_SIZE)
-    return depths
+    keys = _clip_keys(depths, camera) if metric == "clip" else _sortable(depths, nan_last=True)
+    if state.is_visible is not None:
+        keys[~state.is_visible] = LAST_KEY
+    return keys
 
 
-def view_rows(camera: Camera, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+def _clip_keys(depths: NDArray[np.float32], camera: Camera) -> NDArray[np.uint32]:
+    """Return the bits of far plane - clip z, both as float32 arithmetic finds them in the projection matrix.
+
+    Negative differences keep their sign bit and come last, as nearest.
+    """
+    near, far = np.float64(camera.near), np.float64(camera.far)
+    slope, shift = np.float32(far / (far - near)), np.float32(-far * near / (far - near))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        recovered = -shift / (slope - np.float32(1))
+        differences = recovered - (slope * depths + shift)
+    keys = differences.view(np.uint32).copy()
+    keys[np.isnan(depths)] = LAST_KEY
+    return keys
+
+
+def view_rows(camera: Camera, origin: NDArray[np.float64], matrix: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the view as (12,) float64 for means relative to `origin`: rows of the rotation with their translation."""
     # In float64, before anything is narrowed: a distant origin must cost no precision.
-    rotation = camera.viewmat[:3, :3]
-    translation = rotation @ origin + camera.viewmat[:3, 3]
-    return np.concatenate([rotation, translation[:, None]], axis=1).ravel()
-
-
-def depth_keys(depths: NDArray[np.float32], is_visible: NDArray[np.bool_] | None) -> NDArray[np.uint32]:
-    """Return keys (N,) that sort ascending; NaN and what is not visible go last."""
-    keys = _sortable(depths, nan_last=True)
-    if is_visible is not None:
-        keys[~is_visible] = LAST_KEY
-    return keys
+    view = camera.viewmat if matrix is None else camera.viewmat @ matrix
+    translation = view[:3, :3] @ origin + view[:3, 3]
+    return np.concatenate([view[:3, :3], translation[:, None]], axis=1).ravel()
 
 
 def sort_keys(keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
