@@ -17,7 +17,7 @@ def _edge(record, sign, y_low, y_high):
     The boundary is x = (-k y +- sqrt(q - h^2 y^2)) / s; its extreme lies at y = -+ k sqrt(q) / (h sqrt(h^2 + k^2)).
     """
     s, k, h, q = record[R.REC_S], record[R.REC_K], record[R.REC_H], record[R.REC_Q]
-    zero = q * 0
+    zero = record.dtype.type(0)
     reach = np.sqrt(q) / h
     y = -sign * reach * k / np.sqrt(h * h + k * k)
     y = min(max(y, y_low, -reach), y_high, reach)

@@ -86,12 +86,10 @@ def find_survivors(state: SceneState, cutouts: Sequence[Cutout]) -> NDArray[np.b
     for cutout in cutouts:
         if cutout.kind == "none":
             continue
-        rotation = cutout.matrix[:3, :3]
-        shift = rotation @ state.cloud.origin + cutout.matrix[:3, 3]
-        places = means @ rotation.T.astype(means.dtype) + shift.astype(means.dtype)
-        if cutout.kind == "ellipsoid":
-            is_inside = np.square(places).sum(axis=1) <= 1
-        else:
-            is_inside = (np.abs(places) <= 1).all(axis=1)
+        rotation = cutout.matrix[:3, :3].astype(means.dtype)
+        shift = (cutout.matrix[:3, :3] @ state.cloud.origin + cutout.matrix[:3, 3]).astype(means.dtype)
+        places = shift + sum(means[:, axis, None] * rotation[None, :, axis] for axis in range(3))
+        is_ball = cutout.kind == "ellipsoid"
+        is_inside = np.square(places).sum(axis=1) <= 1 if is_ball else (np.abs(places) <= 1).all(axis=1)
         survives &= is_inside != cutout.invert
     return survives
