@@ -106,7 +106,8 @@ def unity(splat, camera, px, py, options):
 
 def spark(splat, camera, px, py, options):
     """Spark 2; variants name the accumulator: "packed", "ext" and "none"."""
-    color = _color(splat, camera, min(options["degree"], 3))
+    # Negative colors are cut as wherever SH are decoded; a stock target, 8 bits deep, cuts them at the latest.
+    color = np.maximum(0, _color(splat, camera, min(options["degree"], 3)))
     offset, scales, quat, opacity, color, ties = oracle_accumulator.requantize(
         options["variant"],
         splat["mean"] - camera.position,
