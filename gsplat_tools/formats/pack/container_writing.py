@@ -21,6 +21,7 @@ from gsplat_tools.parallel import map_ordered
 FRAME_ROWS = 1 << 16
 
 Codec = Literal["zstd", "none"]
+Buffer = bytes | memoryview
 Rows = Mapping[str, NDArray[Any]]
 """The rows of some splats in every stream, by the stream's name."""
 
@@ -135,10 +136,11 @@ def _pieces(layouts: Sequence[StreamLayout], rows: list[Rows]) -> Iterator[tuple
         yield index, [np.ascontiguousarray(row[layout.name], DTYPES[layout.dtype]) for row in rows]
 
 
-def _store(piece: tuple[int, list[NDArray[Any]], Codec, int]) -> tuple[int, bytes, int]:
+def _store(piece: tuple[int, list[NDArray[Any]], Codec, int]) -> tuple[int, Buffer, int]:
     """Return the number of the stream, the stored bytes of a frame and the checksum of its raw bytes."""
     index, arrays, codec, level = piece
-    raw = b"".join([values.tobytes() for values in arrays])
+    # One array, the common case, is taken as it lies in memory.
+    raw = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays)).reshape(-1).view(np.uint8).data
     checksum = zlib.crc32(raw)
     if codec == "none":
         return index, raw, checksum

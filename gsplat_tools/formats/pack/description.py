@@ -178,8 +178,9 @@ class BoxTally:
         """Take stored positions (N, 3), and the motion of the cloud that they come from, into account."""
         if len(positions) == 0:
             return
-        self._low = np.minimum(self._low, positions.min(axis=0))
-        self._high = np.maximum(self._high, positions.max(axis=0))
+        # Column by column: numpy reduces short rows slowly.
+        self._low = np.minimum(self._low, [column.min() for column in positions.T])
+        self._high = np.maximum(self._high, [column.max() for column in positions.T])
         if cloud.velocities is not None and cloud.durations is not None:
             self._speed = max(self._speed, float(np.linalg.norm(cloud.velocities.astype(np.float64), axis=1).max()))
             self._time = max(self._time, float(cloud.durations.max()))
