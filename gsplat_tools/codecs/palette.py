@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from gsplat_tools.parallel import run_blocks
 
@@ -15,6 +20,8 @@ _TILE_ELEMENTS = 1 << 22
 
 _TOLERANCE = 2e-3
 """Rounds end when one lowers the error by less than this share."""
+
+_MOMENT_ROWS = 4096
 
 
 def nearest_labels(points: Float32, centroids: Float32, penalties: Float32 | None = None) -> tuple[Labels, Float32]:
@@ -53,24 +60,47 @@ def nearest_labels(points: Float32, centroids: Float32, penalties: Float32 | Non
         offsets = points[start:stop] - centroids[labels[start:stop]]
         distances[start:stop] = np.einsum("nd,nd->n", offsets, offsets)
 
-    run_blocks(assign, len(points), tile)
+    with one_blas_thread():
+        run_blocks(assign, len(points), tile)
     return labels, distances
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keep matrix products to the thread that calls them: blocks already keep all processors busy.
+
+    Products that start threads of their own wait for each other, a multiple of the time where the machine does other
+    work as well.
+    """
+    with _controller().limit(limits=1, user_api="blas"):
+        yield
+
+
+@lru_cache(maxsize=1)
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def _nearest_of_three(points: Float32, centroids: Float32) -> tuple[Labels, Float32]:
     """Return labels and squared distances by an exact search."""
-    from gsplat_tools.kernels.nearest import nearest_of_three
+    from gsplat_tools.kernels.nearest import LEAF_SIZE, build_tree, nearest_in_tree
 
-    order = np.argsort(centroids[:, 0], kind="stable")
-    ascending = np.ascontiguousarray(centroids[order], np.float32)
+    centroids = np.ascontiguousarray(centroids, np.float32)
     points = np.ascontiguousarray(points, np.float32)
+    depth = max(0, int(np.ceil(np.log2(len(centroids) / LEAF_SIZE)))) + 1
+    order = np.empty(len(centroids), np.int64)
+    axes, cuts = np.empty((1 << (depth + 1)) - 1, np.int64), np.empty((1 << (depth + 1)) - 1, np.float32)
+    build_tree(centroids, order, axes, cuts)
+    leaves = centroids[order]
     labels = np.empty(len(points), np.int64)
     distances = np.empty(len(points), np.float32)
-    run_blocks(lambda start, stop: nearest_of_three(points, ascending, start, stop, labels, distances), len(points))
-    return order[labels], distances
+    run_blocks(
+        lambda start, stop: nearest_in_tree(points, leaves, order, axes, cuts, start, stop, labels, distances), len(points)
+    )
+    return labels, distances
 
 
-def fit_palette(points: Float32, weights: Float32, *, size: int, seed: int = 0, max_rounds: int = 10) -> Float32:
+def fit_palette(points: Float32, weights: Float32, *, size: int, max_rounds: int = 3) -> Float32:
     """Return at most `size` centroids with a small weighted squared error to the points.
 
     Parameters
@@ -81,52 +111,70 @@ def fit_palette(points: Float32, weights: Float32, *, size: int, seed: int = 0, 
         (N,) positive weights.
     size
         Largest number of centroids.
-    seed
-        Of the first choice of centroids; the same seed gives the same bits at any number of threads.
     max_rounds
         Lloyd rounds at most; they end earlier when the error hardly falls.
 
     Returns
     -------
     Float32
-        (K, D), K <= size; the distinct points themselves where they are no more than `size`.
+        (K, D), K <= size, close entries near each other; the distinct points themselves where they are no more than
+        `size`. The same bits at any number of threads.
 
     Raises
     ------
     ValueError
         The size is below 1, or there is no point.
+
+    Notes
+    -----
+    The cell that errs most is cut in two along its widest principal direction until there are `size` cells; Lloyd rounds
+    then start from their means. Nothing is drawn at random. The cuts alone come within a few percent of converged
+    k-means in three dimensions, and three rounds after them reach what eight rounds reach from random points
+    (docs/codebooks.md).
     """
+    from gsplat_tools.kernels.splitting import split_cells
+
     if size < 1 or len(points) == 0:
         raise ValueError(f"needs a size of at least 1 and at least one point, got {size} and {len(points)}")
     points = np.ascontiguousarray(points, np.float32)
-    if len(points) <= size or _has_few_distinct(points, size):
-        distinct = np.unique(points, axis=0)
-        if len(distinct) <= size:
-            return distinct
-    centroids = _first_centroids(points, weights, size, seed)
+    weights = np.ascontiguousarray(weights, np.float32)
+    center, axes = principal_axes(points, weights)
+    centroids = np.empty((min(size, len(points)), points.shape[1]), np.float32)
+    turned = np.ascontiguousarray((points - center) @ axes)
+    count = split_cells(turned, weights, centroids, np.empty(len(points), np.int64))
+    centroids = centroids[:count] @ axes.T + center
+    if count < size:
+        return np.unique(points, axis=0)  # every cell holds equal points
     before = np.inf
     for _ in range(max_rounds):
         labels, distances = nearest_labels(points, centroids)
         error = float(np.dot(distances.astype(np.float64), weights))
-        centroids = _means_of_clusters(points, weights, labels, distances, centroids)
         if error >= before * (1 - _TOLERANCE):
             break
         before = error
+        centroids = _means_of_clusters(points, weights, labels, distances, centroids)
     return centroids
 
 
-def _has_few_distinct(points: Float32, size: int) -> bool:
-    """Whether a sample of the points repeats itself so much that counting all is worth the time."""
-    sample = points[:: max(1, len(points) // 4096)]
-    return len(np.unique(sample, axis=0)) < min(size, 0.9 * len(sample))
+def principal_axes(points: Float32, weights: Float32) -> tuple[Float32, Float32]:
+    """Return the weighted mean (D,) and the principal directions as columns (D, D), the widest first.
 
-
-def _first_centroids(points: Float32, weights: Float32, size: int, seed: int) -> Float32:
-    """Draw distinct points without replacement, with odds that follow the square root of the weights."""
-    # Exponential keys: the `size` smallest of E_i / p_i are a draw without replacement (Efraimidis and Spirakis 2006).
-    keys = np.random.default_rng(seed).exponential(size=len(points)) / np.sqrt(weights.astype(np.float64))
-    chosen = np.sort(np.argsort(keys, kind="stable")[:size])
-    return points[chosen]
+    Sums run over fixed blocks, so that the number of threads changes nothing.
+    """
+    dimensions = points.shape[1]
+    total = float(weights.sum(dtype=np.float64))
+    center = (np.einsum("n,nd->d", weights.astype(np.float64), points) / total).astype(np.float32)
+    if dimensions <= 3:
+        return center, np.eye(dimensions, dtype=np.float32)
+    moments = np.zeros((dimensions, dimensions))
+    for start in range(0, len(points), _MOMENT_ROWS):
+        offsets = (points[start : start + _MOMENT_ROWS] - center).astype(np.float64)
+        moments += (offsets * weights[start : start + _MOMENT_ROWS, None]).T @ offsets
+    _, axes = np.linalg.eigh(moments / total)
+    axes = axes[:, ::-1]
+    # Eigenvectors have no sign of their own: make the largest component positive.
+    signs = np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(dimensions)])
+    return center, np.ascontiguousarray(axes * np.where(signs == 0, 1, signs), np.float32)
 
 
 def _means_of_clusters(points: Float32, weights: Float32, labels: Labels, distances: Float32, centroids: Float32) -> Float32:

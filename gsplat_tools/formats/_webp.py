@@ -48,7 +48,7 @@ def encode_rgba(image: Image, effort: int = DEFAULT_EFFORT) -> bytes:
     MissingDependencyError
         Pillow was built without libwebp.
     """
-    from PIL import Image as pillow_image
+    from PIL.Image import fromarray
 
     if not 0 <= effort < len(_EFFORTS):
         raise ValueError(f"effort must be 0 to {len(_EFFORTS) - 1}, got {effort}")
@@ -56,7 +56,7 @@ def encode_rgba(image: Image, effort: int = DEFAULT_EFFORT) -> bytes:
     target = io.BytesIO()
     try:
         # Without `exact` libwebp changes colors where alpha is 0.
-        pillow_image.fromarray(image, "RGBA").save(target, "WEBP", lossless=True, exact=True, method=method, quality=quality)
+        fromarray(image, "RGBA").save(target, "WEBP", lossless=True, exact=True, method=method, quality=quality)
     except KeyError as error:
         raise MissingDependencyError("this Pillow cannot write WebP; install one that has libwebp") from error
     return target.getvalue()

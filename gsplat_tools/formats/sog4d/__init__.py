@@ -124,9 +124,9 @@ FORMAT = Format(
     read_options=Sog4dReadOptions,
     write_options=Sog4dOptions,
     presets={
-        "fast": {"webp_effort": 1},
+        "fast": {"webp_effort": 1, "palette_rounds": 1},
         "balanced": {},
-        "best": {"webp_effort": 8},
+        "best": {"rotation": "best", "sh0_entries": 256, "palette_rounds": 8, "webp_effort": 9},
     },
     model=("unity", "fork-4d"),
 )

@@ -13,6 +13,7 @@ from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CloudError
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
 from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, SH0_ENTRIES
+from gsplat_tools.parallel import run_blocks
 
 Float32 = NDArray[np.float32]
 
@@ -24,6 +25,18 @@ THIN = 0.02
 
 _MIN_LOG = -27.0
 _MAX_LOG = 88.0
+_MAX_HALF = np.float32(65504)
+
+# Palettes are fitted on so many rows at least, and so many for each entry.
+_MIN_TRAINING = 1 << 15
+_TRAINING_PER_ENTRY = 12
+_PROBES = 8192
+
+# Rounding of stored entries relative to the error that the codebook leaves anyway: it adds about 2 percent to the mean
+# square, and takes the text of a scale triple from 7 bytes to 5, an SH palette to a third (docs/codebooks.md).
+_SCALE_GRID = 0.7
+_CENTROID_GRID = 0.5
+_FINE_STEP = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,12 +125,7 @@ def scales_at(coordinates: Float32) -> Float32:
     return scales
 
 
-def fit_shared(
-    sample: Sample,
-    first: GaussianCloud,
-    options: Sog4dOptions,
-    layout: tuple[int, int],
-) -> Shared:
+def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layout: tuple[int, int]) -> Shared:
     """Fit codebooks and palettes.
 
     Parameters
@@ -127,37 +135,22 @@ def fit_shared(
     first
         The first frame, which decides the rotation frame of each splat.
     options
-        Sizes, types and seed.
+        Sizes and types.
     layout
         (width, height) of the images.
     """
-    from gsplat_tools.codecs.palette import fit_palette, nearest_labels
-    from gsplat_tools.codecs.scalar_codebook import fit_codebook
-
-    frames = _rotation_frames(first, options)
-    # The splats of the first frame are relabelled; which axis comes first in a sample hardly matters otherwise.
-    log_scales = _turn_sample(sample, first, frames)
-    points = scale_coordinates(log_scales)
-    size = options.scale_codebook_size or default_scale_size(len(first))
-    codebook = scales_at(fit_palette(points, sample.weights, size=size, seed=options.seed, max_rounds=8))
-    codebook = _ordered(_rounded(codebook))
-    with np.errstate(divide="ignore"):
-        _, distances = nearest_labels(points, scale_coordinates(np.log(codebook)))
-    sh0_weights = np.repeat(sample.weights, 3)
-    if options.sh0_codebook == "fit":
-        values = np.concatenate([sample.sh0.ravel(), np.array(sample.sh0_range, np.float32)])
-        weights = np.concatenate([sh0_weights, np.full(2, sh0_weights.min(), np.float32)])
-        sh0_codebook = fit_codebook(values, weights, size=SH0_ENTRIES)
-    else:
-        sh0_codebook = BASE_RGB
+    frames = None if options.rotation == "reference" else falling_frames(first)
+    # Axes in the order in which frames put them: hardly any splat changes that order later in a sequence.
+    log_scales = sample.log_scales if frames is None else -np.sort(-sample.log_scales, axis=1)
+    codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), len(first), options)
     return Shared(
         options=options,
         width=layout[0],
         height=layout[1],
         bands=first.sh_degree,
         scale_codebook=codebook,
-        scale_error=float(distances.mean(dtype=np.float64)),
-        sh0_codebook=sh0_codebook,
+        scale_error=error,
+        sh0_codebook=BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, options.sh0_entries),
         palettes=_fit_palettes(sample, first.sh_degree, len(first), options),
         rotation_frames=frames,
     )
@@ -165,7 +158,7 @@ def fit_shared(
 
 def default_scale_size(num_splats: int) -> int:
     """Return how many scale triples a codebook gets by default."""
-    return int(np.clip(num_splats // 12, 256, 16384))
+    return int(np.clip(num_splats // 20, 512, 16384))
 
 
 def default_palette_size(num_splats: int) -> int:
@@ -173,43 +166,18 @@ def default_palette_size(num_splats: int) -> int:
     return int(np.clip(num_splats // 32, 64, 16384))
 
 
-def _fit_palettes(sample: Sample, bands: int, num_splats: int, options: Sog4dOptions) -> tuple[Palette, ...]:
-    """Fit one palette, or one a band, and round it to its stored type."""
-    from gsplat_tools.codecs.palette import fit_palette, nearest_labels
+def falling_frames(cloud: GaussianCloud) -> NDArray[np.uint8]:
+    """Return for every splat the frame in which its scales fall and its quaternion has the largest w.
 
-    if bands == 0:
-        return ()
-    parts = [("shN", 0, sample.shN.shape[1])]
-    if options.version == 2:
-        starts = np.cumsum([0, *BAND_COEFFICIENTS])
-        parts = [(f"sh{i + 1}", int(starts[i]), BAND_COEFFICIENTS[i]) for i in range(bands)]
-    size = options.sh_palette_size or default_palette_size(num_splats)
-    rows = _training_rows(len(sample.weights), size)
-    palettes = []
-    for name, first, coefficients in parts:
-        points = sample.shN[rows, first : first + coefficients].reshape(-1, 3 * coefficients)
-        centroids = fit_palette(points, sample.weights[rows], size=size, seed=options.seed, max_rounds=6)
-        stored = np.clip(centroids, -65504, 65504).astype("<f2" if options.centroids == "f16" else "<f4").astype(np.float32)
-        probe = points[:: max(1, len(points) // 8192)]
-        error = float(nearest_labels(probe, stored)[1].mean(dtype=np.float64))
-        palettes.append(Palette(name, first, coefficients, stored, error))
-    return tuple(palettes)
+    Codebooks of triples then hold one order of axes instead of six, and w is the largest of the four bytes.
+    """
+    from gsplat_tools.kernels.sorted_frames import frames_of_falling_scales
 
-
-def _training_rows(available: int, size: int) -> slice:
-    """Return an even choice of rows to fit a palette on."""
-    wanted = max(1 << 15, 8 * size)
-    return slice(None, None, max(1, available // wanted))
-
-
-def _rotation_frames(first: GaussianCloud, options: Sog4dOptions) -> NDArray[np.uint8] | None:
-    """Return the frame of each splat, chosen once for all frames, or None to leave axes as they are."""
-    if options.rotation != "small":
-        return None
-    from gsplat_tools.kernels.rotation_frames import frames_of_largest_w
-
-    frames = np.empty(len(first), np.uint8)
-    frames_of_largest_w(first.quats, frames)
+    frames = np.empty(len(cloud), np.uint8)
+    run_blocks(
+        lambda start, stop: frames_of_falling_scales(cloud.quats[start:stop], cloud.log_scales[start:stop], frames[start:stop]),
+        len(cloud),
+    )
     return frames
 
 
@@ -224,32 +192,83 @@ def turned(cloud: GaussianCloud, frames: NDArray[np.uint8] | None) -> tuple[Floa
     return quats, log_scales
 
 
-def _turn_sample(sample: Sample, first: GaussianCloud, frames: NDArray[np.uint8] | None) -> Float32:
-    """Return the sample's log scales with axes in the order that frames give them."""
-    if frames is None:
-        return sample.log_scales
-    # All six orders of axes occur in turned splats: give each row of the sample one of them, by its place.
-    orders = np.array([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
-    rows = orders[np.arange(len(sample.log_scales)) % 6]
-    return np.take_along_axis(sample.log_scales, rows, axis=1)
+def _fit_scales(log_scales: Float32, weights: Float32, num_splats: int, options: Sog4dOptions) -> tuple[Float32, float]:
+    """Return the scale codebook as stored, and the mean squared error that it leaves."""
+    from gsplat_tools.codecs.palette import fit_palette, nearest_labels
 
-
-def _rounded(codebook: Float32) -> Float32:
-    """Return scales rounded to three digits, which is finer than the codebook and short as text."""
+    points = scale_coordinates(log_scales)
+    size = options.scale_codebook_size or default_scale_size(num_splats)
+    centroids = fit_palette(points, weights, size=size, max_rounds=2)
+    error = float(nearest_labels(points, centroids)[1].mean(dtype=np.float64))
+    codebook = _on_grid(scales_at(centroids), _SCALE_GRID * np.sqrt(error / 3))
     with np.errstate(divide="ignore"):
-        exponents = np.floor(np.log10(codebook.astype(np.float64)))
-    units = 10.0 ** np.where(np.isfinite(exponents), exponents - 2, 0)
-    return (np.rint(codebook / units) * units).astype(np.float32)
+        stored = scale_coordinates(np.log(codebook))
+    return codebook, float(nearest_labels(points, stored)[1].mean(dtype=np.float64))
 
 
-def _ordered(codebook: Float32) -> Float32:
-    """Return distinct entries along a path through them, so that close indices mean close scales."""
-    from gsplat_tools.ops.ordering import morton_order
+def _on_grid(codebook: Float32, step: float) -> Float32:
+    """Return distinct scales in rising order, their logarithms on a grid of `step`, with three digits.
 
-    distinct = np.unique(codebook, axis=0)
+    The text of a number that occurs again costs next to nothing; the grid is finer than the cells of the codebook.
+    """
+    wide = codebook.astype(np.float64)
+    if step > 0:
+        with np.errstate(divide="ignore"):
+            wide = np.exp(np.rint(np.log(wide) / step) * step)
+    digits = 2 if step < _FINE_STEP else 1
     with np.errstate(divide="ignore"):
-        logs = np.maximum(np.log(distinct), np.float32(_MIN_LOG))
-    return distinct[morton_order(logs)]
+        exponents = np.floor(np.log10(wide))
+    units = 10.0 ** np.where(np.isfinite(exponents), exponents - digits, 0)
+    rounded = (np.rint(wide / units) * units).astype(np.float32) if step > 0 else codebook
+    return np.unique(np.where(rounded > 0, rounded, codebook), axis=0)
+
+
+def _fit_sh0(sample: Sample, entries: int) -> Float32:
+    """Return the sh0 codebook: the optimum for the sample, from the smallest to the largest value of all frames."""
+    from gsplat_tools.codecs.scalar_codebook import fit_codebook
+
+    weights = np.repeat(np.sqrt(sample.weights), 3)
+    values = np.concatenate([sample.sh0.ravel(), np.array(sample.sh0_range, np.float32)])
+    codebook = fit_codebook(values, np.concatenate([weights, np.full(2, weights.min(), np.float32)]), size=entries)
+    return np.concatenate([codebook, np.full(SH0_ENTRIES - entries, codebook[-1], np.float32)])
+
+
+def _fit_palettes(sample: Sample, bands: int, num_splats: int, options: Sog4dOptions) -> tuple[Palette, ...]:
+    """Fit one palette, or one a band, and round it to its stored type."""
+    from gsplat_tools.codecs.palette import fit_palette, nearest_labels
+
+    if bands == 0:
+        return ()
+    parts = [("shN", 0, sample.shN.shape[1])]
+    if options.version == 2:
+        starts = np.cumsum([0, *BAND_COEFFICIENTS])
+        parts = [(f"sh{i + 1}", int(starts[i]), BAND_COEFFICIENTS[i]) for i in range(bands)]
+    size = options.sh_palette_size or default_palette_size(num_splats)
+    rows = slice(None, None, max(1, len(sample.weights) // max(_MIN_TRAINING, _TRAINING_PER_ENTRY * size)))
+    weights = np.sqrt(sample.weights[rows])
+    palettes = []
+    for name, first, coefficients in parts:
+        points = sample.shN[rows, first : first + coefficients].reshape(-1, 3 * coefficients)
+        centroids = fit_palette(points, weights, size=size, max_rounds=options.palette_rounds)
+        probe = points[:: max(1, len(points) // _PROBES)]
+        step = _grid_step(float(nearest_labels(probe, centroids)[1].mean(dtype=np.float64)) / points.shape[1])
+        stored = _stored_centroids(centroids, step, options)
+        error = float(nearest_labels(probe, stored)[1].mean(dtype=np.float64))
+        palettes.append(Palette(name, first, coefficients, stored, error))
+    return tuple(palettes)
+
+
+def _grid_step(error: float) -> float:
+    """Return a power of two of at most half the root mean square error of a coefficient, 0 where there is none."""
+    return 2.0 ** np.floor(np.log2(_CENTROID_GRID * np.sqrt(error))) if error > 0 else 0.0
+
+
+def _stored_centroids(centroids: Float32, step: float, options: Sog4dOptions) -> Float32:
+    """Return centroids as the file holds them: distinct, short vectors first, on a grid that deflates well."""
+    on_grid = np.rint(centroids / np.float32(step)) * np.float32(step) if step > 0 else centroids
+    stored = np.clip(on_grid, -_MAX_HALF, _MAX_HALF).astype("<f2" if options.centroids == "f16" else "<f4")
+    distinct = np.unique(stored.astype(np.float32), axis=0)
+    return distinct[np.argsort(np.einsum("kd,kd->k", distinct, distinct), kind="stable")]
 
 
 def check_finite(cloud: GaussianCloud, frame: int) -> None:

@@ -76,7 +76,6 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: dict[str, Label
     previous
         Labels of the frame before in the same segment; None starts a segment.
     """
-    from gsplat_tools.codecs import quaternion_u8
     from gsplat_tools.codecs.scalar_codebook import nearest_entry
 
     width, height = shared.width, shared.height
@@ -88,7 +87,6 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: dict[str, Label
         scale_coordinates(log_scales), shared.scale_points, shared.scale_error, shared.options.keep_tolerance,
         None if previous is None else previous["scale"],
     )  # fmt: skip
-    mode: quaternion_u8.Mode = "reference" if shared.options.rotation == "reference" else "best"
     colors = np.empty((len(cloud), 4), np.uint8)
     colors[:, :3] = nearest_entry(cloud.sh0, shared.sh0_codebook)
     colors[:, 3] = opacity_bytes(cloud.opacity_logits)
@@ -96,7 +94,7 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: dict[str, Label
         "position_hi": rgba_image((codes >> 8).astype(np.uint8), width, height),
         "position_lo": rgba_image((codes & 0xFF).astype(np.uint8), width, height),
         "scale_indices": index_image(labels["scale"], width, height),
-        "rotation": rgba_image(quaternion_u8.encode(quats, mode=mode), width, height),
+        "rotation": rgba_image(rotation_bytes(quats, shared.options), width, height),
         "sh0": rgba_image(colors, width, height),
     }
     for palette in shared.palettes:
@@ -115,6 +113,30 @@ def position_codes(means: Float32, low: Float32, high: Float32) -> NDArray[np.ui
     span = high.astype(np.float64) - low
     steps = 65535 / np.where(span > 0, span, 1.0)
     return np.rint((means - low.astype(np.float64)) * steps).astype(np.uint16)
+
+
+def rotation_bytes(quats: Float32, options: Sog4dOptions) -> NDArray[np.uint8]:
+    """Return the bytes w x y z of quaternions in the frames that were chosen."""
+    from gsplat_tools.codecs import quaternion_u8
+
+    if options.rotation == "small":
+        return constant_w_bytes(quats, options.rotation_steps)
+    return quaternion_u8.encode(quats, mode=options.rotation)
+
+
+def constant_w_bytes(quats: Float32, steps: int) -> NDArray[np.uint8]:
+    """Return quaternions with w as the same number of steps everywhere, so that one byte of four says nothing.
+
+    Where w is not the largest component (later frames of a sequence) the quaternion is shortened until all fit.
+    """
+    wide = quats.astype(np.float64)
+    wide *= np.where(wide[:, :1] < 0, -1.0, 1.0)
+    largest = np.abs(wide).max(axis=1, keepdims=True)
+    is_null = largest == 0
+    wide[is_null[:, 0]] = (1, 0, 0, 0)
+    # 127 steps for the largest component are the end of the byte.
+    scale = np.minimum(steps / np.maximum(wide[:, :1], 1e-30), 127 / np.where(is_null, 1.0, largest))
+    return (np.rint(wide * scale) + 128).astype(np.uint8)
 
 
 def opacity_bytes(logits: Float32) -> NDArray[np.uint8]:

@@ -55,12 +55,20 @@ class Sog4dOptions:
         Numbers in SH palettes: "f16" or "f32".
     sh0_codebook
         "fit": the optimum for the data; "base-rgb": the fixed table of 256 colors in [0, 1].
+    sh0_entries
+        Entries of the codebook that are used, 2 to 256; fewer make smaller files.
     webp_effort
         0 (fastest) to 9 (smallest).
     zip
         "stored", "deflated", or "auto": images stored, the rest deflated.
     rotation
-        "best": smallest error; "small": smallest file; "reference": the unit quaternion rounded.
+        "best": smallest error; "small": smallest file; "reference": the unit quaternion rounded. But for "reference" the
+        axes of a splat are named so that its scales fall, once for all frames.
+    rotation_steps
+        With "small", the byte steps of w, 16 to 127; the error is at most atan(sqrt(3) / 2 / steps) times two, and fewer
+        steps make smaller files.
+    palette_rounds
+        Rounds of k-means for SH palettes at most.
     keep_tolerance
         In sequences a splat keeps its scale and SH labels of the frame before as long as that adds no more than this
         share of the palette's own mean squared error.
@@ -71,7 +79,7 @@ class Sog4dOptions:
     width, height
         Layout of the images; by default the smallest that is nearly square.
     seed
-        Of the palette.
+        Of the sample that codebooks are fitted on, where there are too many splats to take all.
     """
 
     version: Literal[1, 2] = 1
@@ -81,9 +89,12 @@ class Sog4dOptions:
     sh_palette_size: int | None = None
     centroids: Literal["f16", "f32"] = "f16"
     sh0_codebook: Literal["fit", "base-rgb"] = "fit"
+    sh0_entries: int = 128
     webp_effort: int = DEFAULT_EFFORT
     zip: ZipMode = "auto"
-    rotation: RotationMode = "best"
+    rotation: RotationMode = "small"
+    rotation_steps: int = 64
+    palette_rounds: int = 3
     keep_tolerance: float = 0.05
     time_mapping: Literal["auto", "uniform", "explicit"] = "auto"
     frame_times: Sequence[float] | None = None
@@ -102,11 +113,14 @@ class Sog4dOptions:
         _check_range("delta_segment_length", self.delta_segment_length, 1, 1 << 31)
         _check_range("scale_codebook_size", self.scale_codebook_size, 1, MAX_CODEBOOK)
         _check_range("sh_palette_size", self.sh_palette_size, 1, MAX_PALETTE)
+        _check_range("sh0_entries", self.sh0_entries, 2, 256)
+        _check_range("rotation_steps", self.rotation_steps, 16, 127)
+        _check_range("palette_rounds", self.palette_rounds, 0, 100)
         _check_range("webp_effort", self.webp_effort, 0, 9)
         _check_range("width", self.width, 1, MAX_SIDE)
         _check_range("height", self.height, 1, MAX_SIDE)
-        if not 0 <= self.keep_tolerance < float("inf"):
-            raise CapabilityError(f"keep_tolerance must be 0 or more, got {self.keep_tolerance}")
+        if not 0 <= self.keep_tolerance <= 1:
+            raise CapabilityError(f"keep_tolerance must be 0 to 1, got {self.keep_tolerance}")
 
 
 def _check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
