@@ -11,6 +11,7 @@ from gsplat_tools.errors import CloudError
 from gsplat_tools.parallel import run_blocks
 
 Mode = Literal["best", "reference"]
+FrameMode = Literal["best", "small"]
 
 MAX_ANGLE = 2.0 * float(np.arcsin(1.0 / 127.0))
 """Largest rotation error of both modes, in radians (0.902 degrees).
@@ -47,16 +48,75 @@ def encode(quats: NDArray[np.floating[Any]], *, mode: Mode = "best") -> NDArray[
 
     if mode not in get_args(Mode):
         raise ValueError(f"mode must be one of {get_args(Mode)}, got {mode!r}")
+    values = _checked(quats)
+    codes = np.empty(values.shape, np.uint8)
+    quantize = kernels.quantize_best if mode == "best" else kernels.quantize_reference
+    run_blocks(lambda start, stop: quantize(values[start:stop], codes[start:stop]), len(values))
+    return codes
+
+
+def encode_with_frames(
+    quats: NDArray[np.floating[Any]], log_scales: NDArray[np.floating[Any]], *, mode: FrameMode = "best"
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Quantize rotations to four bytes, each in the one of its 24 frames that suits best.
+
+    Relabeling the axes of a Gaussian permutes its scales and does not change its covariance. Not for keyframes that are
+    interpolated, unless one frame serves all of them.
+
+    Parameters
+    ----------
+    quats
+        (N, 4) wxyz, of any length; length 0 is taken as the identity.
+    log_scales
+        (N, 3) natural logs of the scales along the local axes.
+    mode
+        "best" has the smallest error of the covariance; "small" takes the smallest turn, whose bytes compress best, and
+        then the best length.
+
+    Returns
+    -------
+    tuple
+        codes (N, 4) u8 w x y z · log_scales (N, 3) f32 in the order of the new axes.
+
+    Raises
+    ------
+    CloudError
+        A component of a quaternion is not finite.
+    """
+    from gsplat_tools.kernels import quaternion_u8 as kernels
+    from gsplat_tools.kernels import rotation_frames
+
+    if mode not in get_args(FrameMode):
+        raise ValueError(f"mode must be one of {get_args(FrameMode)}, got {mode!r}")
+    values, scales = _checked(quats), np.ascontiguousarray(log_scales, np.float32)
+    if scales.shape != (len(values), 3):
+        raise ValueError(f"log_scales must have shape ({len(values)}, 3), got {scales.shape}")
+    codes, frames = np.empty(values.shape, np.uint8), np.empty(len(values), np.uint8)
+
+    def quantize(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        if mode == "best":
+            kernels.quantize_in_frames(values[part], scales[part], codes[part], frames[part])
+            return
+        turned, permuted = np.empty((stop - start, 4), np.float32), np.empty((stop - start, 3), np.float32)
+        rotation_frames.frames_of_largest_w(values[part], frames[part])
+        rotation_frames.apply_frames(values[part], scales[part], frames[part], turned, permuted)
+        kernels.quantize_best(turned, codes[part])
+
+    run_blocks(quantize, len(values))
+    axes = rotation_frames.FRAME_AXES[frames]
+    return codes, np.take_along_axis(scales, axes, axis=1)
+
+
+def _checked(quats: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Return quaternions as the kernels take them."""
     values = np.ascontiguousarray(quats, np.float32)
     if values.ndim != 2 or values.shape[1] != 4:
         raise ValueError(f"quats must have shape (N, 4), got {values.shape}")
     if not np.isfinite(values).all():
         bad = int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
         raise CloudError(f"{bad} of {len(values)} quaternions are not finite; drop them first", field="quats")
-    codes = np.empty(values.shape, np.uint8)
-    quantize = kernels.quantize_best if mode == "best" else kernels.quantize_reference
-    run_blocks(lambda start, stop: quantize(values[start:stop], codes[start:stop]), len(values))
-    return codes
+    return values
 
 
 def decode(codes: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -81,6 +81,56 @@ def test_encode__refuses_what_is_not_finite():
         quaternion_u8.encode(np.array([[1, 0, 0, 0], [np.nan, 0, 0, 0]], np.float32))
 
 
+def covariances(quats, log_scales):
+    w, x, y, z = (quats.astype(np.float64) / np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    axes = np.array(rows).transpose(2, 0, 1) * np.exp(log_scales.astype(np.float64))[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def test_encode_with_frames__keeps_the_splat_and_lowers_its_error():
+    rng = np.random.default_rng(5)
+    quats, log_scales = rng.normal(size=(5000, 4)).astype(np.float32), rng.uniform(-6, -1, (5000, 3)).astype(np.float32)
+    source = covariances(quats, log_scales)
+
+    def errors(codes, scales):
+        return np.linalg.norm(covariances(quaternion_u8.decode(codes), scales) - source, axis=(1, 2)) / np.linalg.norm(
+            source, axis=(1, 2)
+        )
+
+    plain = errors(quaternion_u8.encode(quats), log_scales)
+    best = errors(*quaternion_u8.encode_with_frames(quats, log_scales))
+    small = errors(*quaternion_u8.encode_with_frames(quats, log_scales, mode="small"))
+
+    assert best.mean() <= 0.4 * plain.mean()
+    assert best.max() <= 0.5 * plain.max()
+    assert small.max() <= 2 * plain.max()
+
+
+def test_encode_with_frames__small_takes_the_smallest_turn():
+    quats = np.random.default_rng(6).normal(size=(5000, 4)).astype(np.float32)
+
+    codes, log_scales = quaternion_u8.encode_with_frames(quats, np.tile(np.float32([1, 2, 3]), (5000, 1)), mode="small")
+
+    # No rotation is further than 62.8 degrees from the nearest relabeling of the axes; 1 degree for the rounding.
+    assert quaternion_u8.decode(codes)[:, 0].min() >= np.cos(np.deg2rad(63.8 / 2))
+    np.testing.assert_array_equal(np.sort(log_scales, axis=1), np.tile([1, 2, 3], (5000, 1)))
+
+
+def test_encode_with_frames__takes_flat_and_round_splats():
+    quats = np.array([[1, 0, 0, 0], [0.3, 0.2, 0.1, 0.9], [0, 0, 0, 0]], np.float32)
+    log_scales = np.array([[-np.inf] * 3, [-4] * 3, [0, 0, -np.inf]], np.float32)
+
+    codes, permuted = quaternion_u8.encode_with_frames(quats, log_scales)
+
+    np.testing.assert_array_equal(np.sort(permuted, axis=1), np.sort(log_scales, axis=1))
+    assert (np.linalg.norm(codes.astype(int) - 128, axis=1) > 60).all()
+
+
 def test_decode__is_unit_with_w_not_negative_for_every_code():
     codes = np.random.default_rng(2).integers(0, 256, (20_000, 4)).astype(np.uint8)
     codes[0] = 128
