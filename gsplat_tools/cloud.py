@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_tools.constants import MAX_SH_DEGREE
+from gsplat_tools.constants import MAX_SH_DEGREE, TEMPORAL_CUTOFF
 from gsplat_tools.errors import CloudError
 
 Float32 = NDArray[np.float32]
@@ -52,6 +52,8 @@ class GaussianCloud:
         (N,) window length, or standard deviation, normalized time, or None.
     time_model
         How `times` and `durations` are read: "window" or "gaussian".
+    temporal_cutoff
+        Weight below which a splat of the gaussian time model is hidden, in (0, 1).
     coordinate_system
         Axis letters such as "RUB" (right, up, back), or "unknown".
     origin
@@ -77,6 +79,7 @@ class GaussianCloud:
     times: Float32 | None = None
     durations: Float32 | None = None
     time_model: TimeModel = "window"
+    temporal_cutoff: float = TEMPORAL_CUTOFF
     coordinate_system: str = "unknown"
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     splat_model: SplatModel = "default"
@@ -101,6 +104,8 @@ class GaussianCloud:
         self._set_array("shN", rest.shape)
         if self.time_model not in get_args(TimeModel):
             raise CloudError(f"expected one of {get_args(TimeModel)}, found {self.time_model!r}", field="time_model")
+        if not 0 < self.temporal_cutoff < 1:
+            raise CloudError(f"expected a number between 0 and 1, found {self.temporal_cutoff!r}", field="temporal_cutoff")
         if self.splat_model not in get_args(SplatModel):
             raise CloudError(f"expected one of {get_args(SplatModel)}, found {self.splat_model!r}", field="splat_model")
         origin = np.array(self.origin, np.float64)
@@ -167,7 +172,7 @@ def concatenate(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
         raise CloudError("cannot join an empty list of clouds")
     first = clouds[0]
     for index, cloud in enumerate(clouds):
-        for name in ("sh_degree", "has_motion", "time_model", "coordinate_system", "splat_model"):
+        for name in ("sh_degree", "has_motion", "time_model", "temporal_cutoff", "coordinate_system", "splat_model"):
             if getattr(cloud, name) != getattr(first, name):
                 raise CloudError(f"cloud {index} has {getattr(cloud, name)}, the first {getattr(first, name)}", field=name)
         if not np.array_equal(cloud.origin, first.origin):
@@ -191,6 +196,8 @@ def empty_cloud(count: int, sh_degree: int, *, has_motion: bool = False) -> Gaus
 
 
 METADATA_FIELDS = tuple(
-    f.name for f in fields(GaussianCloud) if f.name in {"time_model", "coordinate_system", "origin", "splat_model"}
+    f.name
+    for f in fields(GaussianCloud)
+    if f.name in {"time_model", "temporal_cutoff", "coordinate_system", "origin", "splat_model"}
 )
 """Fields that describe the cloud as a whole."""

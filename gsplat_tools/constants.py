@@ -8,3 +8,6 @@ MAX_SH_DEGREE = 4
 
 VISIBLE_OPACITY = 1.0 / 255.0
 """Below this opacity no 8-bit target draws a splat (alpha cut-off of the 3DGS rasterizer, Kerbl et al. 2023)."""
+
+TEMPORAL_CUTOFF = 0.01
+"""Temporal weight below which a splat of the gaussian time model is hidden where a file says nothing (raiscui/gsplat-unity)."""

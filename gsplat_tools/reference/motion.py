@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from gsplat_tools.attributes.motion import positions_at, weights_at
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.ops.motion import motion_bounds
 from gsplat_tools.sequence import GaussianSequence
 
-Scene = GaussianCloud | GaussianSequence
+__all__ = ["Scene", "SceneState", "evaluate_scene", "motion_bounds"]
 
-TEMPORAL_GAUSSIAN_CUTOFF = 0.01
-"""Weight below which a splat of the gaussian time model is invisible (default of the .splat4d version 2 META section)."""
+Scene = GaussianCloud | GaussianSequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ def evaluate_scene(
     t: float | None,
     *,
     dtype: DTypeLike = np.float32,
-    temporal_cutoff: float = TEMPORAL_GAUSSIAN_CUTOFF,
+    temporal_cutoff: float | None = None,
 ) -> SceneState:
     """Return a scene at a time.
 
@@ -57,7 +58,7 @@ def evaluate_scene(
     dtype
         Type that means and weights are computed in.
     temporal_cutoff
-        Weight below which a splat of the gaussian time model is hidden.
+        Weight below which a splat of the gaussian time model is hidden; by default the cloud's own.
 
     Returns
     -------
@@ -80,46 +81,8 @@ def evaluate_scene(
         return SceneState(cloud := scene.at(0.0 if t is None else t), cloud.means.astype(dtype, copy=False), None, None)
     if t is None or scene.velocities is None or scene.times is None or scene.durations is None:
         return SceneState(scene, scene.means.astype(dtype, copy=False), None, None)
-    times, durations = scene.times.astype(dtype, copy=False), scene.durations.astype(dtype, copy=False)
-    age = np.asarray(t, dtype) - times
-    means = scene.means.astype(dtype, copy=False) + scene.velocities.astype(dtype, copy=False) * age[:, None]
-    if scene.time_model == "window":
-        # Not age <= duration: the shaders compare t with the end of the window.
-        is_visible = (times <= np.asarray(t, dtype)) & (np.asarray(t, dtype) <= times + durations)
-        return SceneState(scene, means, is_visible, is_visible.astype(dtype))
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        weights = np.exp(-0.5 * np.square(age / durations)).astype(dtype)
-    is_visible = weights >= temporal_cutoff
-    return SceneState(scene, means, is_visible, np.where(is_visible, weights, np.asarray(0, dtype)))
-
-
-def motion_bounds(
-    cloud: GaussianCloud, *, temporal_cutoff: float = TEMPORAL_GAUSSIAN_CUTOFF
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return (min, max) in world units, (3,) float64, that no splat leaves while it is visible.
-
-    Parameters
-    ----------
-    cloud
-        A cloud, with or without motion.
-    temporal_cutoff
-        As in `evaluate_scene`.
-
-    Returns
-    -------
-    tuple or None
-        The static box, grown on every side by the largest speed times the longest duration; None for an empty cloud.
-
-    Source
-    ------
-    4DGS bounds expansion of raiscui/gsplat-unity; for the gaussian model the duration is sqrt(-2 ln cutoff) sigma.
-    """
-    box = cloud.bounds()
-    if box is None or cloud.velocities is None or cloud.durations is None:
-        return box
-    speed = float(np.linalg.norm(cloud.velocities.astype(np.float64), axis=1).max())
-    duration = float(cloud.durations.max())
-    if cloud.time_model == "gaussian":
-        duration *= float(np.sqrt(-2 * np.log(temporal_cutoff)))
-    padding = speed * max(duration, 0.0)
-    return box[0] - padding, box[1] + padding
+    arrays = (scene.means, scene.velocities, scene.times, scene.durations)
+    means, velocities, times, durations = (values.astype(dtype, copy=False) for values in arrays)
+    cutoff = scene.temporal_cutoff if temporal_cutoff is None else temporal_cutoff
+    weights = weights_at(times, durations, t, scene.time_model, cutoff)
+    return SceneState(scene, positions_at(means, velocities, times, t), weights > 0, weights)

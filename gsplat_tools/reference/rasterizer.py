@@ -14,7 +14,7 @@ from gsplat_tools.reference._stages import compose_image, draw_splats, find_orde
 from gsplat_tools.reference.camera import Camera
 from gsplat_tools.reference.cutouts import Cutout, find_survivors
 from gsplat_tools.reference.models import Model
-from gsplat_tools.reference.motion import TEMPORAL_GAUSSIAN_CUTOFF, Scene, SceneState, evaluate_scene
+from gsplat_tools.reference.motion import Scene, SceneState, evaluate_scene
 from gsplat_tools.reference.sorting import checked_order
 
 Precision = Literal["float32", "float64"]
@@ -88,7 +88,7 @@ def render(
     gamma_to_linear: bool = False,
     antialias: bool | None = None,
     cutouts: Sequence[Cutout] = (),
-    temporal_cutoff: float = TEMPORAL_GAUSSIAN_CUTOFF,
+    temporal_cutoff: float | None = None,
 ) -> Rendering:
     """Draw a scene as a target would show it.
 
@@ -125,7 +125,7 @@ def render(
     cutouts
         Volumes that hide splats, see `Cutout`; model `unity` only.
     temporal_cutoff
-        Weight below which a splat of the gaussian time model is hidden.
+        Weight below which a splat of the gaussian time model is hidden; by default the cloud's own.
 
     Returns
     -------

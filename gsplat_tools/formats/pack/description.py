@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.attributes.coordinate_systems import UNKNOWN, is_known
+from gsplat_tools.attributes.motion import reach
 from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud, SplatModel, TimeModel
 from gsplat_tools.constants import MAX_SH_DEGREE
 from gsplat_tools.errors import CorruptDataError
@@ -25,9 +26,6 @@ MOTION_LAYOUTS = (
     StreamLayout("times", "f32", ()),
     StreamLayout("durations", "f32", ()),
 )
-
-_TEMPORAL_CUTOFF = 0.01
-"""A temporal Gaussian below this weight shows nothing (default of the 4D formats, docs/formats/splat4d.md)."""
 
 Box = tuple[list[float], list[float]]
 
@@ -193,5 +191,5 @@ class BoxTally:
         """Return the box grown by the largest speed times the longest time, or None without motion."""
         if time_model is None or not np.isfinite(self._low).all():
             return None
-        reach = self._speed * self._time * (1.0 if time_model == "window" else float(np.sqrt(-2 * np.log(_TEMPORAL_CUTOFF))))
-        return ((self._low - reach).tolist(), (self._high + reach).tolist()) if np.isfinite(reach) else None
+        margin = reach(self._speed, self._time, time_model)
+        return ((self._low - margin).tolist(), (self._high + margin).tolist()) if np.isfinite(margin) else None

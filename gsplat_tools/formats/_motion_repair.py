@@ -6,11 +6,9 @@ import warnings
 
 import numpy as np
 
+from gsplat_tools.attributes.motion import MIN_SIGMA
 from gsplat_tools.cloud import Float32, GaussianCloud, TimeModel
 from gsplat_tools.errors import LossyConversionWarning
-
-MIN_SIGMA = 1e-6
-"""Smallest duration (standard deviation) of the gaussian model."""
 
 
 class MotionRepair:
