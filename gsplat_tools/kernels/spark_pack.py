@@ -92,18 +92,24 @@ def opacity_code(logit):
 
 
 @device()
-def pack_lanes(rows, halves, ranges, words, counts):
-    """Words of LANES splats.
+def pack_lanes(rows, halves, start, count, ranges, packed, counts):
+    """Words of up to LANES splats.
 
     rows    float64 (NUM_ROWS, LANES)  read and overwritten: quaternion of any length, 0 being the identity; natural logs
                                        of the scales, -inf being flat; opacity code 0..255; color
-    halves  uint16 (LANES, 3)          read: position
+    halves  uint16 (N, 3)              read: position
+    start   int                        splat of the first lane
+    count   int                        lanes that hold splats
     ranges  float64 (4,)               read: RGB_MIN, RGB_MAX, LN_MIN, LN_MAX
-    words   uint32 (LANES, 4)          written
+    packed  uint32 (N, 4)              written from `start` on
     counts  int64 (NUM_COUNTS,)        added to
     """
     low, extent = ranges[RGB_MIN], ranges[RGB_MAX] - ranges[RGB_MIN]
     ln_min, steps = ranges[LN_MIN], 254.0 / (ranges[LN_MAX] - ranges[LN_MIN])
+    # Loops run over all lanes; those without a splat hold values that clamp nothing.
+    for j in range(count, LANES):
+        for k in range(NUM_ROWS):
+            rows[k, j] = low if k >= RED else (ln_min if LN <= k < OPACITY else 0.0)
     invalid = 0
     for j in range(LANES):
         total = rows[0, j]
@@ -142,31 +148,28 @@ def pack_lanes(rows, halves, ranges, words, counts):
     counts[FLATTENED] += flattened
 
     pack_rotations(rows)
-    for j in range(LANES):
-        x, y, z = np.uint32(halves[j, 0]), np.uint32(halves[j, 1]), np.uint32(halves[j, 2])
-        words[j, 0] = (
+    overflows = 0
+    for j in range(count):
+        i = start + j
+        x, y, z = np.uint32(halves[i, 0]), np.uint32(halves[i, 1]), np.uint32(halves[i, 2])
+        packed[i, 0] = (
             np.uint32(np.int32(rows[RED, j]))
             | (np.uint32(np.int32(rows[RED + 1, j])) << np.uint32(8))
             | (np.uint32(np.int32(rows[RED + 2, j])) << np.uint32(16))
             | (np.uint32(np.int32(rows[OPACITY, j])) << np.uint32(24))
         )
-        words[j, 1] = x | (y << np.uint32(16))
-        words[j, 2] = (
+        packed[i, 1] = x | (y << np.uint32(16))
+        packed[i, 2] = (
             z | (np.uint32(np.int32(rows[X, j])) << np.uint32(16)) | (np.uint32(np.int32(rows[Y, j])) << np.uint32(24))
         )
-        words[j, 3] = (
+        packed[i, 3] = (
             np.uint32(np.int32(rows[LN, j]))
             | (np.uint32(np.int32(rows[LN + 1, j])) << np.uint32(8))
             | (np.uint32(np.int32(rows[LN + 2, j])) << np.uint32(16))
             | (np.uint32(np.int32(rows[W, j])) << np.uint32(24))
         )
-    overflows = 0
-    for j in range(LANES):
-        is_over = (
-            ((halves[j, 0] & np.uint16(0x7C00)) == np.uint16(0x7C00))
-            | ((halves[j, 1] & np.uint16(0x7C00)) == np.uint16(0x7C00))
-            | ((halves[j, 2] & np.uint16(0x7C00)) == np.uint16(0x7C00))
-        )
+        infinity = np.uint32(0x7C00)
+        is_over = ((x & infinity) == infinity) | ((y & infinity) == infinity) | ((z & infinity) == infinity)
         overflows += 1 if is_over else 0
     counts[OVERFLOWS] += overflows
 
@@ -217,29 +220,6 @@ def pack_rotations(rows):
         rows[W, j] = np.float64(code - (1 if w > _LAST_WS[code] else 0))
 
 
-@device()
-def _pack_batch(rows, halves, start, count, ranges, packed, counts):
-    """Pack `count` splats from `start` on; a last batch that is not full is filled up with splats that clamp nothing."""
-    if count == LANES:
-        pack_lanes(rows, halves[start : start + LANES], ranges, packed[start : start + LANES], counts)
-        return
-    filled = np.empty((LANES, 3), np.uint16)
-    words = np.empty((LANES, 4), np.uint32)
-    # Element by element: assignments between slices would compile the machinery of their error messages.
-    for j in range(LANES):
-        for k in range(3):
-            filled[j, k] = halves[start + j, k] if j < count else np.uint16(0)
-    for j in range(count, LANES):
-        for k in range(NUM_ROWS):
-            rows[k, j] = ranges[LN_MIN] if LN <= k < OPACITY else 0.0
-        for k in range(RED, RED + 3):
-            rows[k, j] = ranges[RGB_MIN]
-    pack_lanes(rows, filled, ranges, words, counts)
-    for j in range(count):
-        for k in range(4):
-            packed[start + j, k] = words[j, k]
-
-
 @kernel()
 def encode_values(halves, ln_scales, quats, opacities, colors, ranges, packed, counts):
     """Words of splats whose values are activated.
@@ -266,7 +246,7 @@ def encode_values(halves, ln_scales, quats, opacities, colors, ranges, packed, c
             below = np.floor(opacities[i] * 255.0)
             code = below + 1.0 if opacities[i] * 255.0 - below >= 0.5 else below
             rows[OPACITY, j] = min(code, 255.0) if code > 0.0 else 0.0
-        _pack_batch(rows, halves, start, count, ranges, packed, counts)
+        pack_lanes(rows, halves, start, count, ranges, packed, counts)
 
 
 @kernel()
@@ -307,4 +287,4 @@ def encode_cloud(halves, log_scales, quats, opacity_logits, sh0, frames, ranges,
                 rows[Z, j] = w * d + x * c - y * b + z * a
                 for k in range(3):
                     rows[LN + k, j] = np.float64(log_scales[i, FRAME_AXES[f, k]])
-        _pack_batch(rows, halves, start, count, ranges, packed, counts)
+        pack_lanes(rows, halves, start, count, ranges, packed, counts)

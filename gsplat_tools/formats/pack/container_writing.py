@@ -19,6 +19,7 @@ from gsplat_tools.formats.pack.container import ALIGNMENT, DTYPES, HEADER, LAYOU
 from gsplat_tools.parallel import map_ordered
 
 FRAME_ROWS = 1 << 16
+MAX_LEVEL = 22
 
 Codec = Literal["zstd", "none"]
 Buffer = bytes | memoryview

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats.base import Bounds, FileInfo, Scene
 from gsplat_tools.formats.pack import arrays, container, container_writing, words
 from gsplat_tools.formats.pack.container import Container
-from gsplat_tools.formats.pack.container_writing import Codec, Rows
+from gsplat_tools.formats.pack.container_writing import MAX_LEVEL, Codec, Rows
 from gsplat_tools.formats.pack.description import MOTION_LAYOUTS, BoxTally, Description
 from gsplat_tools.parallel import map_ordered
 from gsplat_tools.sequence import GaussianSequence
@@ -162,10 +162,12 @@ def write(
     Raises
     ------
     CapabilityError
-        The scene is a sequence.
+        The scene is a sequence, or the codec or its level is unknown.
     """
     if isinstance(scene, GaussianSequence):
         raise CapabilityError("a .gspk holds one moment; choose one with --time or --frame")
+    if codec not in get_args(Codec) or not 1 <= level <= MAX_LEVEL:
+        raise CapabilityError(f"expected codec zstd of level 1 to {MAX_LEVEL}, or none, found {codec!r} of level {level}")
     chunks = as_chunks(scene)
     facts = description(chunks)
     tally = BoxTally()

@@ -379,6 +379,12 @@ def test_write__counts_positions_beyond_half_over_all_chunks():
         written(parts, "spark")
 
 
+@pytest.mark.parametrize("options", [{"codec": "gzip"}, {"zstd_level": 0}, {"zstd_level": 23}])
+def test_write__refuses_unknown_codecs_and_levels(options):
+    with pytest.raises(CapabilityError, match="expected codec zstd of level 1 to 22, or none"):
+        written(make_cloud(1, 0), "uncompressed", **options)
+
+
 def test_write__refuses_an_unknown_range_choice():
     with pytest.raises(CapabilityError, match="'default' or 'fit'"):
         written(make_cloud(1, 0), "spark", spark_encoding="tight")
