@@ -8,6 +8,7 @@ _SMALLEST_NORMAL = np.float32(2.0**-14)
 _OVERFLOW = np.float32(65520.0)
 # Numbers in [0.5, 1) have steps of 2^-24, the step of half subnormals.
 _SUBNORMAL_SHIFT = np.float32(0.75)
+_SIGN = np.uint32(0x80000000)
 _INFINITY = np.float32(np.inf)
 
 
@@ -26,4 +27,6 @@ def round_to_half(x):
         rounded = _INFINITY
     else:
         return single
-    return rounded if single >= np.float32(0) else -rounded
+    # By its bit, so that -0 keeps its sign.
+    sign = np.uint32(np.float32(single).view(np.uint32) & _SIGN)
+    return np.uint32(np.float32(rounded).view(np.uint32) | sign).view(np.float32)
