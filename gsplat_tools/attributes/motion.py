@@ -72,10 +72,12 @@ def weights_at(
         (N,) in [0, 1], of the dtype of `times`; 0 where a value is NaN.
     """
     moment = times.dtype.type(t)
+    weights: NDArray[Floating]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
         if time_model == "window":
             # Not age <= duration: the shaders compare t with the end of the window.
-            return ((times <= moment) & (moment <= times + durations)).astype(times.dtype)
+            weights = ((times <= moment) & (moment <= times + durations)).astype(times.dtype)
+            return weights
         weights = np.exp(times.dtype.type(-0.5) * np.square((moment - times) / durations)).astype(times.dtype)
         weights[~(weights >= cutoff)] = 0
         return weights
