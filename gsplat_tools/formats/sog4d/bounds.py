@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.codecs.rotation_bounds import relative_covariance_bound
+from gsplat_tools.codecs.rotation_bounds import covariance_bound_of_ranges
 from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog4d.bundle import Bundle
 from gsplat_tools.formats.sog4d.meta import frame_path
@@ -63,7 +63,7 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
         "sh0": sh0,
         # Sorted values lie between the sorted ends of their intervals.
         "scales": _distance(np.sort(logs, axis=1), np.sort(least, axis=1), np.sort(largest, axis=1)),
-        "covariances": relative_covariance_bound(logs, _distance(logs, least, largest), rotation_bound(codes)) + _ROUNDING,
+        "covariances": covariance_bound_of_ranges(logs, least, largest, rotation_bound(codes)) + _ROUNDING,
     }
 
 
