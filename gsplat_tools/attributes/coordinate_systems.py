@@ -16,7 +16,7 @@ UNKNOWN = "unknown"
 Y_UP_OR_DOWN = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 """The eight systems that differ from RUB by signs only, in the order of SPZ's numbers 1 to 8."""
 
-Z_UP_OR_DOWN = ("LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU")
+Z_UP_OR_DOWN = ("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU")
 """The eight systems that need a turn about x as well, in the order of SPZ's numbers 9 to 16."""
 
 _DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}

@@ -44,3 +44,38 @@ def relative_covariance_bound(
         stretched = np.linalg.norm(moves, axis=1) / norms
     turned = np.sqrt(8.0 / 3.0) * np.sin(min(angle, np.pi / 2))
     return np.where(norms > 0, stretched + turned, 0.0)
+
+
+def covariance_bound_of_ranges(
+    log_scales: NDArray[np.floating[Any]], low: NDArray[np.floating[Any]], high: NDArray[np.floating[Any]], angle: float
+) -> NDArray[np.float64]:
+    """Return the largest ||Sigma' - Sigma|| / ||Sigma|| where each log scale ends in a known interval.
+
+    Parameters
+    ----------
+    log_scales
+        (N, 3) natural logs of the source's scales; -inf is flat.
+    low, high
+        Broadcastable to (N, 3): where the decoded log scale lies, however far it was clamped.
+    angle
+        How far the rotation may turn, radians.
+
+    Returns
+    -------
+    NDArray[np.float64]
+        (N,). Where every axis is flat and may not stay so, inf.
+
+    Notes
+    -----
+    As `relative_covariance_bound`, with each squared scale's own largest move.
+    """
+    logs = np.asarray(log_scales, np.float64)
+    longest = logs.max(axis=1, keepdims=True, initial=-np.inf)
+    longest = np.where(np.isfinite(longest), longest, 0.0)
+    with np.errstate(over="ignore"):
+        squares, lowest, highest = (np.exp(2 * (np.broadcast_to(ends, logs.shape) - longest)) for ends in (logs, low, high))
+    norms = np.linalg.norm(squares, axis=1)
+    moves = np.linalg.norm(np.maximum(np.abs(highest - squares), np.abs(squares - lowest)), axis=1)
+    turned = np.sqrt(8.0 / 3.0) * np.sin(min(angle, np.pi / 2))
+    stretched = np.divide(moves, norms, out=np.where(moves > 0, np.inf, 0.0), where=norms > 0)
+    return np.asarray(np.where(norms > 0, stretched + turned, stretched))

@@ -5,11 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsplat_tools.errors import CapabilityError, UnknownFormatError
-from gsplat_tools.formats import ply, sog4d, splat4d
+from gsplat_tools.formats import ply, sog, sog4d, splat4d, spz
 from gsplat_tools.formats.base import SNIFF_BYTES, Format
 from gsplat_tools.formats.pack import gscc, spark, uncompressed
 
-_MODULES: tuple[Format, ...] = (ply.FORMAT, spark.FORMAT, uncompressed.FORMAT, gscc.FORMAT, sog4d.FORMAT, splat4d.FORMAT)
+_MODULES: tuple[Format, ...] = (
+    ply.FORMAT,
+    spark.FORMAT,
+    uncompressed.FORMAT,
+    gscc.FORMAT,
+    sog4d.FORMAT,
+    spz.FORMAT,
+    splat4d.FORMAT,
+)
 
 FORMATS: dict[str, Format] = {record.id: record for record in _MODULES}
 
