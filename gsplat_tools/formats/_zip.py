@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import BinaryIO, Literal
 
 from gsplat_tools.errors import CorruptDataError, LimitExceededError
-from gsplat_tools.formats._issues import Issue, Rule, raise_errors
+from gsplat_tools.formats._issues import Issue, Rule, raise_errors, refuse
 from gsplat_tools.formats._stream import MAX_EXPANSION
 
 Compression = Literal["stored", "deflated"]
@@ -46,20 +46,24 @@ class ZipReader:
     ----------
     stream
         Can seek; stays open as long as entries are read. Reads from several threads are safe.
+    refuses
+        Whether to raise the first error of the directory; else `issues` holds them all.
 
     Raises
     ------
     CorruptDataError, LimitExceededError
-        The archive breaks a rule of `RULES`.
+        The stream is no archive, or breaks a rule of `RULES`.
     """
 
-    def __init__(self, stream: BinaryIO) -> None:
+    def __init__(self, stream: BinaryIO, *, refuses: bool = True) -> None:
         stream.seek(0)
         try:
             self._archive = zipfile.ZipFile(stream)
         except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError, OverflowError) as error:
-            raise CorruptDataError(f"expected a ZIP archive, found none that can be opened ({error})") from error
-        self.issues = raise_errors(check_directory(self._archive.infolist()), RULES)
+            message = f"expected a ZIP archive, found none that can be opened ({error})"
+            raise refuse(Issue(code="zip-invalid", message=message), RULES) from error
+        issues = list(check_directory(self._archive.infolist()))
+        self.issues = raise_errors(issues, RULES) if refuses else issues
         self._last = {info.filename: info for info in self._archive.infolist()}
 
     @property
@@ -96,7 +100,8 @@ class ZipReader:
         try:
             return self._archive.read(info)
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError, RuntimeError) as error:
-            raise CorruptDataError(f"the entry does not decompress ({error})", field=name, frame=frame) from error
+            issue = Issue(code="zip-entry-corrupt", message=f"the entry does not decompress ({error})", field=name, frame=frame)
+            raise refuse(issue, RULES) from error
 
 
 def check_directory(entries: list[zipfile.ZipInfo]) -> Iterator[Issue]:

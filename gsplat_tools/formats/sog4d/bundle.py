@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_tools.errors import CorruptDataError, GsplatError
+from gsplat_tools.errors import FormatError
 from gsplat_tools.formats import _webp
 from gsplat_tools.formats._issues import Issue, raise_errors, refuse
 from gsplat_tools.formats._stream import MAX_EXPANSION, stream_size
@@ -56,15 +56,16 @@ class Bundle:
             It is not a still lossless WebP image of the layout's size.
         """
         data = self.archive.read(path, frame=frame)
+        width, height = self.meta.width, self.meta.height
         try:
-            return _webp.decode_rgba(data, self.meta.width, self.meta.height, field=path, frame=frame)
-        except CorruptDataError as error:
-            is_size = error.message.startswith("expected an image of")
-            error.code = "image-size" if is_size else "image-format"  # type: ignore[attr-defined]
-            raise
-        except GsplatError as error:
+            header = _webp.parse_header(data, field=path, frame=frame)
+            if (header.width, header.height) == (width, height):
+                return _webp.decode_rgba(data, width, height, field=path, frame=frame)
+        except FormatError as error:
             error.code = "image-format"  # type: ignore[attr-defined]
             raise
+        message = f"expected an image of {width} x {height} pixels, found {header.width} x {header.height}"
+        raise refuse(Issue(code="image-size", message=message, field=path, frame=frame), RULES)
 
     def planes(self, frame: int) -> dict[str, Image]:
         """Return the images of a frame by stream name; labels of delta segments are expanded to images."""

@@ -277,7 +277,7 @@ class _DeltaFiles:
             if frame in self._ends:
                 start = self._ends[frame]
                 self.files[_delta_path(palette.name, start)] = label_files.write_delta(
-                    start, len(current), len(palette.centroids), self._blocks[palette.name]
+                    (start, frame + 1 - start), len(current), len(palette.centroids), self._blocks[palette.name]
                 )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gsplat_tools.errors import CorruptDataError, LimitExceededError, TruncatedDataError, UnsupportedVersionError
-from gsplat_tools.formats import _zip
+from gsplat_tools.errors import CorruptDataError, LimitExceededError, UnsupportedVersionError
+from gsplat_tools.formats import _label_delta, _zip
 from gsplat_tools.formats._issues import Rule
 
 MAX_CODEBOOK = 65535
@@ -57,18 +57,7 @@ RULES: dict[str, Rule] = {
     "label-range": _error("SH labels are below the number of palette entries."),
     "centroids-size": _error("A centroid file holds exactly its entries."),
     "centroids-value": _error("Centroids are finite."),
-    "delta-magic": _error("A delta file starts with SOG4DLB1."),
-    "delta-version": Rule(severity="error", meaning="Delta files are of version 1.", error=UnsupportedVersionError),
-    "delta-header": _error("A delta file repeats the segment, splatCount and labelCount of meta.json."),
-    "delta-truncated": Rule(
-        severity="error", meaning="A delta file holds a block for every later frame.", error=TruncatedDataError
-    ),
-    "delta-trailing": _error("Nothing follows the last block of a delta file."),
-    "delta-count": _error("updateCount is at most splatCount."),
-    "delta-splat": _error("splatId is below splatCount."),
-    "delta-order": _error("splatId increases strictly within a block."),
-    "delta-label": _error("newLabel is below the number of palette entries."),
-    "delta-reserved": _error("The last two bytes of a record are 0."),
+    **_label_delta.RULES,
     "vector-list": Rule(
         severity="warning", meaning="Vectors are objects with x, y and z; lists are not read by Unity (normalize repairs)."
     ),
