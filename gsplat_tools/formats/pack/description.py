@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gsplat_tools.attributes.coordinate_systems import UNKNOWN, is_known
 from gsplat_tools.attributes.motion import reach
 from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud, SplatModel, TimeModel
-from gsplat_tools.constants import MAX_SH_DEGREE
+from gsplat_tools.constants import MAX_SH_DEGREE, TEMPORAL_CUTOFF
 from gsplat_tools.errors import CorruptDataError
 from gsplat_tools.formats.pack.container import LAYOUTS, StreamLayout
 from gsplat_tools.formats.pack.encoding import SplatEncoding
@@ -40,7 +40,7 @@ class Description:
         "spark" or "uncompressed"; splats; highest SH band.
     bounds, motion_bounds
         Smallest box round the stored positions, and the same grown by what motion may add, or None.
-    origin, coordinate_system, splat_model, time_model
+    origin, coordinate_system, splat_model, time_model, temporal_cutoff
         As `GaussianCloud` has them; time_model None without motion.
     encoding, rotation
         Ranges and choice of rotation frames of layout "spark".
@@ -55,6 +55,7 @@ class Description:
     coordinate_system: str = UNKNOWN
     splat_model: SplatModel = "default"
     time_model: TimeModel | None = None
+    temporal_cutoff: float = TEMPORAL_CUTOFF
     encoding: SplatEncoding | None = None
     rotation: str | None = None
 
@@ -86,6 +87,8 @@ class Description:
             entry["rotation"] = self.rotation
         if self.time_model is not None:
             entry |= {"time_model": self.time_model, "motion_bounds": _box_to_json(self.motion_bounds)}
+            if self.temporal_cutoff != TEMPORAL_CUTOFF:
+                entry["temporal_cutoff"] = self.temporal_cutoff
         return entry
 
     @classmethod
@@ -119,6 +122,7 @@ class Description:
             coordinate_system=system,
             splat_model=_choice(entry, "splat_model", get_args(SplatModel)),
             time_model=None if time_model is None else _choice(entry, "time_model", get_args(TimeModel)),
+            temporal_cutoff=_cutoff(entry),
             encoding=SplatEncoding.from_json(ranges) if layout == "spark" else None,
             rotation=rotation if isinstance(rotation, str) else None,
         )
@@ -130,6 +134,7 @@ class Description:
             "coordinate_system": self.coordinate_system,
             "splat_model": self.splat_model,
             "time_model": self.time_model or "window",
+            "temporal_cutoff": self.temporal_cutoff,
         }
 
     def world_box(self, box: Box | None) -> Box | None:
@@ -138,6 +143,14 @@ class Description:
             return None
         low, high = ([value + shift for value, shift in zip(corner, self.origin, strict=True)] for corner in box)
         return low, high
+
+
+def _cutoff(entry: Mapping[str, Any]) -> float:
+    """Return the cutoff of the gaussian time model, or its default."""
+    value = entry.get("temporal_cutoff", TEMPORAL_CUTOFF)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
+        raise CorruptDataError(f"expected a number between 0 and 1, found {value!r}"[:200], field="temporal_cutoff")
+    return float(value)
 
 
 def _choice(entry: Mapping[str, Any], key: str, choices: tuple[str, ...]) -> Any:
@@ -187,9 +200,9 @@ class BoxTally:
         """Return the box, or None without positions."""
         return (self._low.tolist(), self._high.tolist()) if np.isfinite(self._low).all() else None
 
-    def motion_box(self, time_model: TimeModel | None) -> Box | None:
+    def motion_box(self, time_model: TimeModel | None, cutoff: float = TEMPORAL_CUTOFF) -> Box | None:
         """Return the box grown by the largest speed times the longest time, or None without motion."""
         if time_model is None or not np.isfinite(self._low).all():
             return None
-        margin = reach(self._speed, self._time, time_model)
+        margin = reach(self._speed, self._time, time_model, cutoff)
         return ((self._low - margin).tolist(), (self._high + margin).tolist()) if np.isfinite(margin) else None

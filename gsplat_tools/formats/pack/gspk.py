@@ -58,7 +58,7 @@ def inspect(stream: BinaryIO) -> FileInfo:
     if description.encoding is not None:
         encoding |= {"splat_encoding": description.encoding.to_json(), "rotation": description.rotation}
     if description.time_model is not None:
-        encoding["time_model"] = description.time_model
+        encoding |= {"time_model": description.time_model, "temporal_cutoff": description.temporal_cutoff}
     return FileInfo(
         version=str(container.VERSION),
         splats=description.count,
@@ -181,7 +181,7 @@ def write(
     def describe() -> dict[str, Any]:
         finish()
         entry = facts.to_json()
-        box, motion_box = tally.box(), tally.motion_box(facts.time_model)
+        box, motion_box = tally.box(), tally.motion_box(facts.time_model, facts.temporal_cutoff)
         entry["bounds"] = None if box is None else {"min": box[0], "max": box[1]}
         if facts.time_model is not None:
             entry["motion_bounds"] = None if motion_box is None else {"min": motion_box[0], "max": motion_box[1]}
@@ -205,6 +205,7 @@ def facts_of(chunks: CloudChunks, layout: str, **changes: Any) -> Description:
         coordinate_system=template.coordinate_system,
         splat_model=template.splat_model,
         time_model=template.time_model if template.has_motion else None,
+        temporal_cutoff=template.temporal_cutoff,
         **changes,
     )
 

@@ -25,6 +25,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.formats._ply_header import read_header
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, NoOptions
 from gsplat_tools.formats.ply.layout import splat_comments, splat_layout
+from gsplat_tools.formats.ply.motion import motion_boxes
 from gsplat_tools.formats.ply.reading import ReadOptions, read, read_chunks
 from gsplat_tools.formats.ply.rows import check_rows
 from gsplat_tools.formats.ply.writing import write
@@ -40,6 +41,8 @@ def matches(head: bytes) -> bool:
 def inspect(stream: BinaryIO) -> FileInfo:
     """Return what the header says, after holding its counts against the size of the file.
 
+    Where splats move, their positions and motion are read as well, for the bounds.
+
     Raises
     ------
     FormatError, TruncatedDataError, CorruptDataError
@@ -50,6 +53,7 @@ def inspect(stream: BinaryIO) -> FileInfo:
     check_rows(stream, header)
     comments = splat_comments(header, is_flat=layout.splat_columns[5] is None)
     x, y, z = map(float, comments.origin)
+    box, motion_box = motion_boxes(stream, header, layout, comments)
     return FileInfo(
         version="1.0",
         splats=layout.vertex.count,
@@ -57,6 +61,8 @@ def inspect(stream: BinaryIO) -> FileInfo:
         coordinate_system=comments.coordinate_system,
         origin=(x, y, z),
         splat_model=comments.splat_model,
+        bounds=box,
+        motion_bounds=motion_box,
         encoding={
             "encoding": header.encoding,
             "header_bytes": header.size,

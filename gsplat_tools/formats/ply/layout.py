@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsplat_tools.attributes.coordinate_systems import is_known
 from gsplat_tools.cloud import REST_COEFFICIENTS, SplatModel, TimeModel
+from gsplat_tools.constants import TEMPORAL_CUTOFF
 from gsplat_tools.errors import CorruptDataError, FormatError
 from gsplat_tools.formats._ply_header import PlyElement, PlyHeader, PlyProperty
 
@@ -111,6 +112,7 @@ class SplatComments:
     coordinate_system: str = "unknown"
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     time_model: TimeModel | None = None
+    temporal_cutoff: float = TEMPORAL_CUTOFF
 
 
 def splat_layout(header: PlyHeader) -> SplatLayout:
@@ -223,11 +225,12 @@ def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
     Source
     ------
     `SplatRenderMode: default | mip | 2dgs` is Brush's comment, `antialiased 0 | 1` is Postshot's; the last one wins, as in
-    splat-transform. origin, coordinate_system and time_model are ours.
+    splat-transform. origin, coordinate_system, time_model and temporal_cutoff are ours.
     """
     model: SplatModel = "default"
     system, origin = "unknown", np.zeros(3)
     time_model: TimeModel | None = None
+    cutoff = TEMPORAL_CUTOFF
     for comment in header.comments:
         words = comment.replace(":", " ").split()
         key, values = (words[0].lower(), words[1:]) if words else ("", [])
@@ -239,7 +242,18 @@ def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
             time_model = cast("Literal['window', 'gaussian']", values[0])
         elif key == "origin" and len(values) == 3:
             origin = _origin(values, origin)
-    return SplatComments("2dgs" if is_flat else model, system, origin, time_model)
+        elif key == "temporal_cutoff" and len(values) == 1:
+            cutoff = _cutoff(values[0], cutoff)
+    return SplatComments("2dgs" if is_flat else model, system, origin, time_model, cutoff)
+
+
+def _cutoff(word: str, otherwise: float) -> float:
+    """Parse a cutoff comment; a word that is no number between 0 and 1 is somebody else's comment."""
+    try:
+        cutoff = float(word)
+    except ValueError:
+        return otherwise
+    return cutoff if 0 < cutoff < 1 else otherwise
 
 
 def _origin(words: list[str], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:

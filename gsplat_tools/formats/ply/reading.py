@@ -129,6 +129,7 @@ class PlyReader:
         comments = self.comments
         cloud = cloud.replace(
             time_model=self._time_model if layout.motion else "window",
+            temporal_cutoff=comments.temporal_cutoff,
             coordinate_system=comments.coordinate_system,
             origin=comments.origin + self._shift,
             splat_model=comments.splat_model,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.constants import TEMPORAL_CUTOFF
 from gsplat_tools.errors import CapabilityError, LossyConversionWarning
 from gsplat_tools.formats.base import NoOptions
 from gsplat_tools.formats.ply.layout import MEANS, MOTION, OPACITY, QUATS, SCALES, SH0
@@ -130,6 +131,8 @@ def _header(template: GaussianCloud, count: int, splat_names: list[str], tail: l
         lines.append("comment origin " + " ".join(repr(float(value)) for value in template.origin))
     if template.has_motion and template.time_model != "window":
         lines.append(f"comment time_model {template.time_model}")
+        if template.temporal_cutoff != TEMPORAL_CUTOFF:
+            lines.append(f"comment temporal_cutoff {template.temporal_cutoff!r}")
     lines.append(f"element vertex {count}")
     lines += [f"property float {name}" for name in splat_names]
     lines += [f"property {_TYPE_NAMES[dtype.str[1:]]} {name}" for name, dtype in tail]
