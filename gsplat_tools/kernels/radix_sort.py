@@ -36,20 +36,20 @@ def sortable_bits(bits, nan_last, start, stop, keys):
 
 
 @kernel()
-def join_words(keys, payload, start, stop, words):
-    """Join keys and payload.
+def join_words(keys, payload, start, stop, words, counts):
+    """Join keys and payload, and count the lowest digit on the way: its upsweep.
 
-    keys         uint32 (N,)  read
-    payload      uint32 (N,)  read; empty: the index
-    start, stop  int          range
-    words        uint64 (N,)  written
+    keys         uint32 (N,)          read
+    payload      uint32 (N,)          read; empty: the index
+    start, stop  int                  the block
+    words        uint64 (N,)          written
+    counts       int64 (NUM_DIGITS,)  added to
     """
-    if len(payload) == 0:
-        for i in range(start, stop):
-            words[i] = np.uint64(np.uint64(keys[i]) << _KEY_SHIFT) | np.uint64(i)
-    else:
-        for i in range(start, stop):
-            words[i] = np.uint64(np.uint64(keys[i]) << _KEY_SHIFT) | np.uint64(payload[i])
+    has_payload = len(payload) > 0
+    for i in range(start, stop):
+        key = np.uint64(keys[i])
+        words[i] = np.uint64(key << _KEY_SHIFT) | np.uint64(payload[i] if has_payload else i)
+        counts[key & _DIGIT_MASK] += 1
 
 
 @kernel()

@@ -211,10 +211,14 @@ def _sort(keys: NDArray[np.uint32], payload: NDArray[np.uint32]) -> tuple[NDArra
 
     count = len(keys)
     source, target = np.empty(count, np.uint64), np.empty(count, np.uint64)
-    joined = source
-    parallel.run_blocks(lambda start, stop: join_words(keys, payload, start, stop, joined), count, _BLOCK_SIZE)
-    for shift in range(0, _KEY_BITS, DIGIT_BITS):
-        if _sort_digit(source, target, shift):
+    joined, counts = source, _new_counts(count)
+    parallel.run_blocks(
+        lambda start, stop: join_words(keys, payload, start, stop, joined, counts[start // _BLOCK_SIZE]), count, _BLOCK_SIZE
+    )
+    if _sort_digit(source, target, 0, counts):
+        source, target = target, source
+    for shift in range(DIGIT_BITS, _KEY_BITS, DIGIT_BITS):
+        if _sort_digit(source, target, shift, _count_digits(source, shift)):
             source, target = target, source
     # The spare buffer becomes the result: two halves of it, as long as the keys.
     halves = target.view(np.uint32)
@@ -223,19 +227,34 @@ def _sort(keys: NDArray[np.uint32], payload: NDArray[np.uint32]) -> tuple[NDArra
     return sorted_keys, sorted_payload
 
 
-def _sort_digit(source: NDArray[np.uint64], target: NDArray[np.uint64], shift: int) -> bool:
-    """Sort by one digit into `target`; return False, and leave it alone, where the digit is the same everywhere."""
-    from gsplat_tools.kernels.radix_sort import NUM_DIGITS, downsweep, scan, upsweep
+def _new_counts(count: int) -> NDArray[np.int64]:
+    """Return a histogram of zeros for each block."""
+    from gsplat_tools.kernels.radix_sort import NUM_DIGITS
 
-    count = len(source)
-    counts = np.zeros((len(parallel.blocks(count, _BLOCK_SIZE)), NUM_DIGITS), np.int64)
-    offsets = np.empty_like(counts)
+    return np.zeros((len(parallel.blocks(count, _BLOCK_SIZE)), NUM_DIGITS), np.int64)
+
+
+def _count_digits(words: NDArray[np.uint64], shift: int) -> NDArray[np.int64]:
+    """Return the histogram of a digit in each block."""
+    from gsplat_tools.kernels.radix_sort import upsweep
+
+    counts = _new_counts(len(words))
     parallel.run_blocks(
-        lambda start, stop: upsweep(source, shift, start, stop, counts[start // _BLOCK_SIZE]), count, _BLOCK_SIZE
+        lambda start, stop: upsweep(words, shift, start, stop, counts[start // _BLOCK_SIZE]), len(words), _BLOCK_SIZE
     )
+    return counts
+
+
+def _sort_digit(source: NDArray[np.uint64], target: NDArray[np.uint64], shift: int, counts: NDArray[np.int64]) -> bool:
+    """Sort by one digit into `target`; return False, and leave it alone, where the digit is the same everywhere."""
+    from gsplat_tools.kernels.radix_sort import downsweep, scan
+
+    offsets = np.empty_like(counts)
     if scan(counts, offsets) <= 1:
         return False
     parallel.run_blocks(
-        lambda start, stop: downsweep(source, shift, start, stop, offsets[start // _BLOCK_SIZE], target), count, _BLOCK_SIZE
+        lambda start, stop: downsweep(source, shift, start, stop, offsets[start // _BLOCK_SIZE], target),
+        len(source),
+        _BLOCK_SIZE,
     )
     return True

@@ -47,10 +47,12 @@ def test_words__join_and_split_without_loss(rng) -> None:  # type: ignore[no-unt
     keys, payload = (rng.integers(0, 1 << 32, 300, dtype=np.uint32) for _ in range(2))
     words = np.empty(300, np.uint64)
     out = np.empty((2, 300), np.uint32)
+    counts = np.zeros(256, np.int64)
 
-    radix_sort.join_words(keys, payload, 0, 300, words)
+    radix_sort.join_words(keys, payload, 0, 300, words, counts)
     radix_sort.split_words(words, 0, 300, out[0], out[1])
 
     assert np.array_equal(out, [keys, payload])
-    radix_sort.join_words(keys, np.empty(0, np.uint32), 0, 300, words)
+    assert np.array_equal(counts, np.bincount(keys & 255, minlength=256))
+    radix_sort.join_words(keys, np.empty(0, np.uint32), 0, 300, words, counts)
     assert np.array_equal(words & np.uint64(0xFFFFFFFF), np.arange(300))
