@@ -10,7 +10,7 @@ import click
 
 from gsplat_tools.cli import _options as options
 from gsplat_tools.cli import _output as output
-from gsplat_tools.cli._errors import one_line, reports_errors
+from gsplat_tools.cli._errors import EXIT_DATA, one_line, reports_errors
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
@@ -202,6 +202,50 @@ def render(file: Path, *, target: Path, jobs: int | None, as_json: bool, progres
         output.print_json(report)
     else:
         click.echo(one_line(json.dumps(report)), err=True)
+
+
+@main.command()
+@click.argument("file", type=options.EXISTING_FILE)
+@click.option(
+    "--max-issues", type=click.IntRange(min=1), default=100, show_default=True, help="Most codes to list, errors first."
+)
+@options.json_option
+@options.progress_option
+@reports_errors
+def validate(file: Path, *, max_issues: int, as_json: bool, progress: bool) -> None:
+    """Hold every rule of the format against the whole file; exit status 1 on errors."""
+    from gsplat_tools.validation import validate as validate_file
+
+    with output.showing_progress(progress):
+        report = validate_file(file, max_issues=max_issues)
+    if as_json:
+        output.print_json(report)
+    else:
+        click.echo(f"{report['file']} ({report['format']}): {'valid' if report['valid'] else 'not valid'}")
+        for issue in report["issues"]:
+            click.echo(f"{issue['severity']:8}{issue['code']} ({issue['count']}): {one_line(issue['message'])}")
+            for offender in issue["first"]:
+                place = ", ".join(f"{name} {value}" for name, value in offender.items() if value is not None)
+                if place:
+                    click.echo(f"        {one_line(place)}")
+        if report["omitted"]:
+            click.echo(f"{report['omitted']} more codes; raise --max-issues to see them")
+    if not report["valid"]:
+        raise SystemExit(EXIT_DATA)
+
+
+@main.command()
+@click.argument("file", type=options.EXISTING_FILE)
+@click.option("-o", "--output", "target", type=click.Path(dir_okay=False, path_type=Path), help="File to write instead.")
+@click.option("--overwrite", is_flag=True, help="Replace the output if it is there.")
+@reports_errors
+def normalize(file: Path, *, target: Path | None, overwrite: bool) -> None:
+    """Repair the meta.json of old .sog4d bundles, in place or into a new file."""
+    from gsplat_tools.validation import normalize as normalize_file
+
+    changes = normalize_file(file, target, overwrite=overwrite)
+    for change in changes or ["nothing to repair"]:
+        click.echo(change, err=True)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, Literal
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.formats._issues import Issue, Rule
 from gsplat_tools.sequence import GaussianSequence
 
 SNIFF_BYTES = 4096
@@ -108,6 +109,13 @@ class Format:
     bounds
         Source cloud (as given to `write`), stream of the written file, frame index: the largest errors that the
         encoding allows, derived from the ranges and bit depths in that file.
+    check
+        Stream to everything that is wrong with it, data decoded; None where reading the file is all there is to check.
+    rules
+        Every code that `check` may give, with its severity.
+    repair
+        Stream of a file and stream to write: a file of today's spelling with the same content; None where there is
+        nothing to repair.
     read_options, write_options
         Frozen dataclasses whose defaults are the balanced choice.
     presets
@@ -128,6 +136,9 @@ class Format:
     write: Callable[[Any, BinaryIO, Any], None] | None = None
     bounds: Callable[[GaussianCloud, BinaryIO, int], Bounds] | None = None
     min_splats: int = 0
+    check: Callable[[BinaryIO], Iterator[Issue]] | None = None
+    rules: Mapping[str, Rule] = field(default_factory=dict)
+    repair: Callable[[BinaryIO, BinaryIO], list[str]] | None = None
     lossless: bool = False
     holds_sequences: bool = False
     holds_motion: bool = False

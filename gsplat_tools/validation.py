@@ -1,0 +1,191 @@
+"""Every rule of a file's format, held against the whole file; findings gathered per code, so that a page is enough."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.constants import VISIBLE_OPACITY
+from gsplat_tools.errors import CapabilityError, FormatError
+from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.formats._issues import Issue, Rule
+from gsplat_tools.formats.base import Format
+from gsplat_tools.formats.loading import located, open_source, read_options
+from gsplat_tools.progress import stage
+from gsplat_tools.sequence import GaussianSequence
+
+FIRST_OFFENDERS = 5
+"""Offenders of each code that a report names."""
+
+GENERAL_RULES = {
+    "unreadable": Rule(severity="error", meaning="the file cannot be read to its end"),
+    "invalid-splats": Rule(severity="warning", meaning="values that are not numbers, or rotations of length zero"),
+    "no-splats": Rule(severity="warning", meaning="there is nothing to draw"),
+    "invisible": Rule(severity="hint", meaning="splats with an opacity below 1/255, which no 8-bit target shows"),
+    "axes-unknown": Rule(severity="info", meaning="the file does not say what its axes are"),
+}
+"""Codes that any format may give, besides its own."""
+
+_SEVERITIES = ("error", "warning", "info", "hint")
+
+
+def rules_of(record: Format) -> dict[str, Rule]:
+    """Return every code that validating a file of this format may give."""
+    return {**GENERAL_RULES, **record.rules}
+
+
+def validate(path: str | Path, *, max_issues: int = 100) -> dict[str, Any]:
+    """Validate a file and return what `gsplat-inspect validate --json` prints.
+
+    Parameters
+    ----------
+    path
+        File to check to its last value.
+    max_issues
+        Most codes to list, errors first; the count of each is exact all the same.
+
+    Returns
+    -------
+    dict
+        file, format, valid, and issues: code, severity, count, message of the first, and the first offenders with
+        frame, splat, path and value.
+
+    Raises
+    ------
+    UnknownFormatError
+        No format claims the file.
+    """
+    path = Path(path)
+    with located(path):
+        stream, record = open_source(path)
+    rules = rules_of(record)
+    gathered: dict[str, dict[str, Any]] = {}
+    with stream, stage("validating", unit="findings") as progress:
+        for issue in _issues(stream, record):
+            progress.advance(1)
+            entry = gathered.setdefault(
+                issue.code,
+                {
+                    "code": issue.code,
+                    "severity": rules[issue.code].severity,
+                    "count": 0,
+                    "message": issue.message,
+                    "first": [],
+                },
+            )
+            entry["count"] += issue.count
+            if len(entry["first"]) < FIRST_OFFENDERS:
+                entry["first"].append(
+                    {"frame": issue.frame, "splat": issue.splat, "path": issue.field, "value": _plain(issue.value)}
+                )
+    issues = sorted(gathered.values(), key=lambda entry: _SEVERITIES.index(entry["severity"]))
+    return {
+        "file": str(path),
+        "format": record.id,
+        "valid": not any(entry["severity"] == "error" for entry in issues),
+        "issues": issues[:max_issues],
+        "omitted": max(0, len(issues) - max_issues),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return a value that JSON can hold."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value if isinstance(value, int | float | str | bool | None) else str(value)
+
+
+def _issues(stream: BinaryIO, record: Format) -> Iterator[Issue]:
+    """Yield what the format's own check finds, and what shows in the decoded splats."""
+    is_sound = True
+    if record.check is not None:
+        for issue in record.check(stream):
+            is_sound &= record.rules[issue.code].severity != "error"
+            yield issue
+    if not is_sound or record.read is None:
+        return
+    stream.seek(0)
+    try:
+        scene = record.read(stream, read_options(record, {}))
+        frames = len(scene) if isinstance(scene, GaussianSequence) else 1
+        for frame_id in range(frames):
+            cloud = scene.frame(frame_id) if isinstance(scene, GaussianSequence) else scene
+            yield from _remarks(cloud, frame_id if frames > 1 else None)
+    except FormatError as error:
+        yield Issue(
+            code="unreadable",
+            message=error.message,
+            field=error.field,
+            frame=error.frame,
+            offset=error.offset,
+            value=error.offset,
+        )
+
+
+def _remarks(cloud: GaussianCloud, frame: int | None) -> Iterator[Issue]:
+    """Yield what any scene may suffer from, whatever its format."""
+    from gsplat_tools.attributes.activations import sigmoid
+    from gsplat_tools.ops.filtering import classify_invalid
+
+    if len(cloud) == 0:
+        yield Issue(code="no-splats", message="the file holds no splats", frame=frame)
+        return
+    keeps, dropped = classify_invalid(cloud)
+    for cause, count in dropped.items():
+        yield Issue(
+            code="invalid-splats",
+            message=f"{count} splats are invalid ({cause}); converting drops them",
+            field=cause,
+            frame=frame,
+            splat=int(np.argmin(keeps)),
+            count=count,
+        )
+    hidden = sigmoid(cloud.opacity_logits) < VISIBLE_OPACITY
+    if hidden.any() and frame is None:
+        yield Issue(
+            code="invisible",
+            message=f"{int(hidden.sum())} splats have an opacity below 1/255; --prune-opacity 0.0039 drops them",
+            splat=int(np.argmax(hidden)),
+            count=int(hidden.sum()),
+        )
+    if cloud.coordinate_system == "unknown" and not frame:
+        yield Issue(
+            code="axes-unknown", message="the file does not say what its axes are; give --source-coordinates when converting"
+        )
+
+
+def normalize(path: str | Path, target: str | Path | None = None, *, overwrite: bool = False) -> list[str]:
+    """Repair what old tools wrote into today's spelling, into a new file or in place.
+
+    Parameters
+    ----------
+    path
+        File to repair.
+    target
+        File to write; by default the file itself, replaced as a whole.
+    overwrite
+        Replace a target that is there.
+
+    Returns
+    -------
+    list of str
+        What was repaired; empty where nothing had to be.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be repaired.
+    """
+    path = Path(path)
+    destination = path if target is None else Path(target)
+    with located(path):
+        source, record = open_source(path)
+        with source:
+            if record.repair is None:
+                raise CapabilityError(f"there is nothing to repair in {record.title}")
+            with replacing(destination, overwrite=overwrite or target is None) as stream:
+                return record.repair(source, stream)
