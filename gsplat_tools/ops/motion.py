@@ -17,7 +17,8 @@ from gsplat_tools.constants import VISIBLE_OPACITY
 from gsplat_tools.errors import CloudError, LossyConversionWarning
 from gsplat_tools.sequence import GaussianSequence
 
-_SHOWN = VISIBLE_OPACITY * (1 - 1e-6)  # a stored byte of 1 passes, as in the evaluation of sequences
+SHOWN = VISIBLE_OPACITY * (1 - 1e-6)
+"""Opacity from which a splat shows: a stored byte of 1 passes, as in the evaluation of sequences."""
 
 HALF_MAXIMUM = math.sqrt(2 * math.log(2))
 """Where a temporal Gaussian falls to half, in sigmas: the window that differs least from it, in the mean square."""
@@ -26,7 +27,8 @@ HALF_MAXIMUM = math.sqrt(2 * math.log(2))
 # closes, sigma and rms 0.356; of one that was open before time began, center and sigma (rms 0.290).
 _SIGMA_OF_WINDOW = 0.38838
 _CENTER_OF_HALF_WINDOW, _SIGMA_OF_HALF_WINDOW = 0.39833, 0.48148
-_SIGMA_OF_ALWAYS = 8.0  # falls by less than half of 1/255 from the middle of time to its ends
+SIGMA_OF_ALWAYS = 8.0
+"""Sigma of a splat that always shows: from the middle of time to its ends it falls by less than half of 1/255."""
 
 
 def motion_bounds(
@@ -81,7 +83,7 @@ def at_time(cloud: GaussianCloud, t: float) -> GaussianCloud:
     weights = _weights(cloud, t)
     opacities = sigmoid(cloud.opacity_logits.astype(np.float64)) * weights
     logits = np.where(weights == 1, cloud.opacity_logits, logit(opacities)).astype(np.float32)
-    logits[~(opacities >= _SHOWN)] = -np.inf
+    logits[~(opacities >= SHOWN)] = -np.inf
     means = cloud.means
     if cloud.velocities is not None and cloud.times is not None:
         means = positions_at(means, cloud.velocities, cloud.times, t)
@@ -93,7 +95,7 @@ def visible_splats(cloud: GaussianCloud, frame_times: Sequence[float] | NDArray[
     opacities = sigmoid(cloud.opacity_logits.astype(np.float64))
     shown = np.zeros(len(cloud), np.bool_)
     for t in frame_times:
-        shown |= opacities * _weights(cloud, float(t)) >= _SHOWN
+        shown |= opacities * _weights(cloud, float(t)) >= SHOWN
     return shown
 
 
@@ -198,7 +200,7 @@ def with_time_model(cloud: GaussianCloud, time_model: TimeModel) -> tuple[Gaussi
         changes["opacity_logits"] = np.where(is_empty, np.float32(-np.inf), cloud.opacity_logits)
     else:
         starts, ends = np.clip(times, 0.0, 1.0), np.clip(times + durations, 0.0, 1.0)
-        new_times, new_durations, errors = _nearest_gaussians(starts, ends)
+        new_times, new_durations, errors = nearest_gaussians(starts, ends)
     # Rounded first, so that the line goes through the mean at the time that is stored.
     new_times = new_times.astype(np.float32)
     shift = (new_times.astype(np.float64) - times)[:, None] * cloud.velocities
@@ -213,7 +215,7 @@ def _weights(cloud: GaussianCloud, t: float) -> NDArray[np.float32]:
     return weights_at(cloud.times, cloud.durations, t, cloud.time_model, cloud.temporal_cutoff)
 
 
-def _nearest_gaussians(
+def nearest_gaussians(
     starts: NDArray[np.float64], ends: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return center, sigma and mean squared error of the best of four Gaussians for every window inside [0, 1]."""
@@ -224,7 +226,7 @@ def _nearest_gaussians(
         (middle, _SIGMA_OF_WINDOW * lengths),
         (_CENTER_OF_HALF_WINDOW * ahead, _SIGMA_OF_HALF_WINDOW * ahead),
         (1 - _CENTER_OF_HALF_WINDOW * behind, _SIGMA_OF_HALF_WINDOW * behind),
-        (np.full_like(middle, 0.5), np.full_like(middle, _SIGMA_OF_ALWAYS)),
+        (np.full_like(middle, 0.5), np.full_like(middle, SIGMA_OF_ALWAYS)),
     ]
     candidates = [(centers, np.maximum(sigmas, MIN_SIGMA)) for centers, sigmas in candidates]
     errors = np.array([_mean_square(starts, ends, centers, sigmas) for centers, sigmas in candidates])
