@@ -14,6 +14,7 @@ _MODULES: tuple[Format, ...] = (
     spark.FORMAT,
     uncompressed.FORMAT,
     gscc.FORMAT,
+    sog.FORMAT,
     sog4d.FORMAT,
     spz.FORMAT,
     splat4d.FORMAT,

@@ -1,0 +1,91 @@
+"""Quaternions in four bytes: the three smaller components, and a tag 252 + index of the largest (SOG)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.codecs.smallest_three import Grid
+from gsplat_tools.errors import CloudError
+from gsplat_tools.parallel import run_blocks
+
+GRID = Grid(steps=127.5 * np.sqrt(2.0), offset=0.5)
+"""Eight bits over -sqrt(1/2)..sqrt(1/2)."""
+
+FIRST_TAG = 252
+"""Fourth byte where w is the largest component; smaller bytes mean the identity."""
+
+
+def encode(quats: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """Quantize rotations to four bytes, rounded to nearest.
+
+    Parameters
+    ----------
+    quats
+        (N, 4) wxyz, of any length; length 0 is taken as the identity.
+
+    Returns
+    -------
+    NDArray[np.uint8]
+        (N, 4): three components in the order of w, x, y, z without the largest (the first of equals), then the tag.
+
+    Raises
+    ------
+    CloudError
+        A component is not finite.
+    """
+    from gsplat_tools.kernels.quaternion_sog import quantize
+
+    values = np.ascontiguousarray(quats, np.float32)
+    if not np.isfinite(values).all():
+        bad = int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
+        raise CloudError(f"{bad} of {len(values)} quaternions are not finite; drop them first", field="quats")
+    codes = np.empty(values.shape, np.uint8)
+    run_blocks(lambda start, stop: quantize(values[start:stop], codes[start:stop]), len(values))
+    return codes
+
+
+def decode(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the quaternions wxyz that (N, 4) codes stand for; a tag below 252 is the identity."""
+    smaller, largest = _components(codes)
+    tags = codes[:, 3].astype(np.int64) - FIRST_TAG
+    quats = np.zeros((len(codes), 4), np.float32)
+    for index in range(4):
+        rows = np.flatnonzero(tags == index)
+        quats[rows, index] = largest[rows]
+        quats[rows[:, None], [k for k in range(4) if k != index]] = smaller[rows]
+    quats[tags < 0] = (1, 0, 0, 0)
+    return quats
+
+
+def max_angle(codes: NDArray[np.uint8]) -> float:
+    """Return the largest rotation error that any source of these codes can have, radians.
+
+    Parameters
+    ----------
+    codes
+        (N, 4) as `encode` gives them.
+
+    Returns
+    -------
+    float
+        At most `GRID.max_angle`, 1.12 degrees; less where every largest component is large.
+
+    Notes
+    -----
+    As for `Grid.max_angle`, with the largest component that is stored: three components lie within half a step each,
+    together e, of their source, and the component left out is at least sqrt(1 - (v + e)^2) on the way, v their length.
+    """
+    smaller, _ = _components(codes)
+    moved = np.sqrt(3.0) / (2 * GRID.steps)
+    longest = np.sqrt(np.square(smaller).sum(axis=1).max(initial=0.0))
+    left_out = np.sqrt(max(1 - (longest + moved) ** 2, 0.0))
+    return float(min(2 * moved / left_out if left_out > 0 else np.inf, GRID.max_angle))
+
+
+def _components(codes: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the three components that are stored, (N, 3), and the one that is not, (N,)."""
+    smaller = (codes[:, :3].astype(np.float64) - 127.5) / GRID.steps
+    return smaller, np.sqrt(np.maximum(1.0 - np.square(smaller).sum(axis=1), 0.0))

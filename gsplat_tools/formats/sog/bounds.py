@@ -1,0 +1,63 @@
+"""Largest errors that a written bundle allows, from its own ranges, codebooks and rotations."""
+
+from __future__ import annotations
+
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.formats.base import Bounds
+from gsplat_tools.formats.sog.bundle import open_bundle
+
+
+def bounds(source: GaussianCloud, stream: BinaryIO) -> Bounds:
+    """Return the largest errors of a bundle.
+
+    Parameters
+    ----------
+    source
+        The cloud as it was given to `write`.
+    stream
+        The bundle.
+
+    Returns
+    -------
+    Bounds
+        means: half a step d of n = sign(x) ln(1 + |x|) is (1 + |x|) (exp(d / 2) - 1), because |n| may grow by d / 2 and no
+        other change of n moves x further · opacities: half of 1 / 255 · sh0 and scales: distance to the nearest entry of
+        the codebook, infinite for flat axes · covariances: those distances and the turn that the rotation codes allow.
+        shN is measured only: it depends on the palette.
+
+    Raises
+    ------
+    FormatError
+        The bundle cannot be read.
+    """
+    from gsplat_tools.codecs import quaternion_sog
+    from gsplat_tools.codecs.rotation_bounds import relative_covariance_bound
+
+    bundle, _ = open_bundle(stream)
+    assert bundle is not None
+    meta = bundle.meta
+    half_step = (meta.means_high - meta.means_low) / 65535 / 2
+    angle = quaternion_sog.max_angle(bundle.codes("quats"))
+    covariances = relative_covariance_bound(source.log_scales, _distances(source.log_scales, meta.scales[0]), angle)
+    # A splat without any extent gets one, so that no relative error is left.
+    has_extent = np.isfinite(source.log_scales).any(axis=1)
+    return {
+        "means": (1 + np.abs(source.means.astype(np.float64))) * np.expm1(half_step),
+        "opacities": np.full(len(source), 0.5 / 255 + 1e-6),  # the ends are read as 1e-6 and 1 - 1e-6
+        "sh0": _distances(source.sh0, meta.sh0[0]),
+        "scales": _distances(np.sort(source.log_scales, axis=1), meta.scales[0]),
+        "covariances": np.where(has_extent, covariances, np.inf),
+    }
+
+
+def _distances(values: NDArray[np.float32], codebook: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return how far each value lies from the nearest entry of an ascending codebook."""
+    from gsplat_tools.codecs.scalar_codebook import nearest_entry
+
+    ascending = np.sort(codebook)
+    return np.abs(ascending[nearest_entry(values, ascending)].astype(np.float64) - values)
