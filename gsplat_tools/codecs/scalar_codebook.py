@@ -100,9 +100,11 @@ def _bin_edges(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDA
     """Return the first index of each bin, and the count at the end: at most `_BINS` bins, none empty."""
     if len(points) <= _BINS:
         return np.arange(len(points) + 1)
-    # An interval of length d that holds weight w has density w / d; codes are spread as (w / d)^(1/3) d.
+    # An interval of length d that holds weight w has density w / d; codes are spread as (w / d)^(1/3) d. Half of the bins
+    # follow the ranks instead, so that far outliers cannot take them all.
     spread = np.cumsum(np.cbrt(weights[1:]) * np.cbrt(np.diff(points)) ** 2)
-    ids = np.concatenate([[0], np.minimum((spread * (_BINS / spread[-1])).astype(np.int64), _BINS - 1)])
+    shares = (spread / spread[-1] + np.arange(1, len(points)) / (len(points) - 1)) / 2
+    ids = np.concatenate([[0], np.minimum((shares * _BINS).astype(np.int64), _BINS - 1)])
     return np.concatenate([np.flatnonzero(np.diff(ids, prepend=-1)), [len(points)]])
 
 
