@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from gsplat_tools.formats.loading import open_scene
 from gsplat_tools.formats.preparing import Prepared
 from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, save
 from gsplat_tools.progress import stage
+from gsplat_tools.retiming import DEFAULT_MOTION, Motion, retime
 from gsplat_tools.sequence import GaussianSequence, Interpolation
 
 VALIDATION_VIEWS = 2
@@ -96,6 +98,7 @@ def convert(
     time_at: float | None = None,
     frame: int | None = None,
     interpolation: Interpolation = "linear",
+    motion: Motion = DEFAULT_MOTION,
     read_options: dict[str, Any] | None = None,
     **options: Any,
 ) -> ConversionReport:
@@ -116,7 +119,9 @@ def convert(
     validation
         How to check the written file; None checks nothing.
     time_at, frame, interpolation
-        Take one moment or one stored frame of a sequence.
+        Take one moment or one stored frame of a sequence, or one moment of a 4D asset.
+    motion
+        How a 4D asset becomes keyframes, or a sequence a 4D asset.
     read_options
         Read options of the source's format.
     **options
@@ -149,7 +154,7 @@ def convert(
         start = time.perf_counter()
         in_chunks = record.streams and (options.get("order") or record.order) == "none"
         with _open(sources, in_chunks, read_options or {}, options) as opened:
-            scene = _at_moment(opened, time_at, frame, interpolation)
+            scene, retimed = retime(opened, record, motion, time_at, frame, interpolation, options)
             seconds["read"] = time.perf_counter() - start
             saved = save(
                 scene,
@@ -170,11 +175,11 @@ def convert(
         splats=saved.splats,
         sh_degree=saved.sh_degree,
         frames=saved.frames,
-        dropped=saved.dropped,
+        dropped=dict(Counter(retimed.dropped) + Counter(saved.dropped)),
         warnings=_unique_warnings(caught),
         seconds=seconds,
         validation=outcome.get("validation"),
-        options=saved.options,
+        options={**saved.options, **retimed.facts},
     )
 
 
@@ -190,17 +195,6 @@ def _open(
     from gsplat_tools.formats.sequences import open_sequence
 
     yield open_sequence(sources, frame_times=options.pop("frame_times", None))
-
-
-def _at_moment(scene: Scene, time_at: float | None, frame: int | None, interpolation: Interpolation) -> Scene:
-    """Return one moment of a sequence if one was asked for."""
-    if time_at is None and frame is None:
-        return scene
-    if time_at is not None and frame is not None:
-        raise CapabilityError("give a time or a frame, not both")
-    if not isinstance(scene, GaussianSequence):
-        raise CapabilityError("the source is not a sequence; leave out --time and --frame")
-    return scene.frame(frame) if frame is not None else scene.at(float(time_at or 0.0), interpolation)
 
 
 def _validate(

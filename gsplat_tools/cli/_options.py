@@ -47,6 +47,20 @@ class DegreeType(click.ParamType[int | str]):
         return int(value)
 
 
+class FramesType(click.ParamType[int | str]):
+    """A number of frames, or auto."""
+
+    name = "N|auto"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        """Return the number or "auto"."""
+        if value == "auto":
+            return "auto"
+        if not re.fullmatch(r"[1-9]\d{0,5}", str(value)):
+            self.fail(f"{value!r} is not a number of frames or auto", param, ctx)
+        return int(value)
+
+
 class FrameTimesType(click.ParamType[list[float]]):
     """A comma-separated list, or a file of one number a line."""
 

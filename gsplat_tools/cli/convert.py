@@ -29,7 +29,9 @@ FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     }),
     ("--codec", "codec", {"type": click.Choice(["zstd", "none"]), "help": "Streams of .gspk; none can be memory-mapped."}),
     ("--sog4d-version", "version", {"type": click.IntRange(1, 2), "help": "SH palette: one (1) or one a band (2)."}),
-    ("--labels", "labels", {"type": click.Choice(["full", "delta-v1"]), "help": "SH labels of .sog4d sequences."}),
+    ("--spz-version", "version", {"type": click.IntRange(2, 4), "help": "Version of SPZ."}),
+    ("--splat4d-version", "version", {"type": click.IntRange(1, 2), "help": "Records alone (1), or with SH (2)."}),
+    ("--labels", "labels", {"type": click.Choice(["full", "delta-v1"]), "help": "SH labels over time."}),
     ("--delta-segment-length", "delta_segment_length", {"type": click.IntRange(min=1), "help": "Frames a delta segment."}),
     ("--time-mapping", "time_mapping", {"type": click.Choice(["uniform", "explicit"]), "help": "Times of .sog4d frames."}),
     ("--scale-codebook-size", "scale_codebook_size", {"type": click.IntRange(1, 65535), "help": "Scale triples of .sog4d."}),
@@ -46,16 +48,17 @@ def _format_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of single formats."""
     for flag, name, arguments in reversed(FORMAT_OPTIONS):
         parameter = f"own_{flag.strip('-').replace('-', '_')}"
-        known = [record.id for record in FORMATS.values() if name in _own_fields(record)]
+        known = [record.id for record in FORMATS.values() if _takes(record, flag, name)]
         if known:
             text = f"{arguments['help']} [{', '.join(known)}]"
             command = click.option(flag, parameter, **{**arguments, "help": text})(command)
     return command
 
 
-def _own_fields(record: Format) -> set[str]:
-    """Return the names of a format's own write options."""
-    return {option.name for option in fields(record.write_options)} if record.write is not None else set()
+def _takes(record: Format, flag: str, name: str) -> bool:
+    """Whether a flag sets an option of a format; each format's version has a flag of its own."""
+    own_fields = {option.name for option in fields(record.write_options)} if record.write is not None else set()
+    return name in own_fields and (name != "version" or flag == f"--{record.id}-version")
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -90,7 +93,7 @@ def _own_fields(record: Format) -> set[str]:
 @click.option("--strict", is_flag=True, help="Refuse invalid splats and losses instead of dropping and counting them.")
 @_format_options
 @click.option("--frame-times", type=options.FrameTimesType(), help="Times of the source frames: a file or a list, in [0, 1].")
-@click.option("--time", "time_at", type=float, help="Take the moment at this normalized time of a sequence.")
+@click.option("--time", "time_at", type=float, help="Take the moment at this normalized time of a sequence or 4D asset.")
 @click.option("--frame", type=click.IntRange(min=0), help="Take this stored frame of a sequence.")
 @click.option(
     "--interpolation",
@@ -98,6 +101,25 @@ def _own_fields(record: Format) -> set[str]:
     default="linear",
     show_default=True,
     help="Between frames, with --time.",
+)
+@click.option("--frames", type=options.FramesType(), help="Bake the motion of a 4D asset to so many keyframes; auto chooses.")
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.01,
+    show_default=True,
+    help="Largest error of opacity between the keyframes of --frames auto, as a share of what shows.",
+)
+@click.option(
+    "--fit-motion",
+    type=click.Choice(["auto", "window", "gaussian"]),
+    help="Fit a sequence to one 4D asset with this time model; .splat4d does so by itself.",
+)
+@click.option(
+    "--fit-report",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Write the residual of every splat of the fit, and a picture of them.",
 )
 @click.option(
     "--shn-order", type=click.Choice(["interleaved", "channel-major"]), help="SH order in .sog4d sources of other tools."
@@ -183,15 +205,16 @@ def _targets(sources: tuple[str, ...], target: Path, formats: tuple[str, ...]) -
 def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, Any]]:
     """Return the arguments of `convert` for every target from the options that were given."""
     from gsplat_tools.convert import Validation
+    from gsplat_tools.retiming import Motion
 
-    own = {}
+    own: list[tuple[str, str, Any]] = []
     for flag, name, _ in FORMAT_OPTIONS:
         value = given.get(f"own_{flag.strip('-').replace('-', '_')}")
         if value is None:
             continue
-        if not any(name in _own_fields(record) for record in records):
+        if not any(_takes(record, flag, name) for record in records):
             raise click.UsageError(f"{flag} does not apply to {' or '.join(record.id for record in records)}")
-        own[name] = value
+        own.append((flag, name, value))
     validation = (
         Validation(views=given["views"], model=given["model"], min_psnr=given["min_psnr"]) if given["validate"] else None
     )
@@ -204,11 +227,14 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
         "time_at": given["time_at"],
         "frame": given["frame"],
         "interpolation": given["interpolation"],
+        "motion": Motion(
+            frames=given["frames"], tolerance=given["tolerance"], fit=given["fit_motion"], fit_report=given["fit_report"]
+        ),
         "read_options": {"shn_order": given["shn_order"]} if given["shn_order"] else {},
         **general,
         **({"frame_times": given["frame_times"]} if given["frame_times"] else {}),
     }
-    return [{**shared, **{name: value for name, value in own.items() if name in _own_fields(record)}} for record in records]
+    return [{**shared, **{name: value for flag, name, value in own if _takes(record, flag, name)}} for record in records]
 
 
 def _summary(report: dict[str, Any]) -> str:

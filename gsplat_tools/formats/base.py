@@ -86,6 +86,8 @@ class Format:
         Whether every attribute comes back with the same bits.
     holds_sequences, holds_motion, holds_extra
         Whether several frames, velocities with times, and other properties can be stored.
+    fits_sequences
+        Whether a sequence is fitted to one 4D asset where none of its frames was asked for.
     stores_origin, stores_coordinates, stores_splat_model
         Whether these facts about the cloud are stored.
     streams
@@ -143,6 +145,7 @@ class Format:
     holds_sequences: bool = False
     holds_motion: bool = False
     holds_extra: bool = False
+    fits_sequences: bool = False
     stores_origin: bool = False
     stores_coordinates: bool = False
     stores_splat_model: bool = False

@@ -100,8 +100,9 @@ def fit_motion(
     """
     sums = _Sums(sequence.frame(0))
     times = sequence.frame_times
-    with stage("fitting motion", 2 * len(sequence), "frames") as progress:
+    with stage("fitting motion", 2 * len(sequence), "frames") as progress, np.errstate(invalid="ignore", over="ignore"):
         for frame_id in range(len(sequence)):
+            # A splat that is not finite somewhere ends up not finite, and is dropped like any other when it is saved.
             sums.add(frame_id, float(times[frame_id]), _checked(sequence, frame_id))
             progress.advance(1)
         splats = np.flatnonzero(sums.visible > 0)

@@ -84,6 +84,7 @@ FORMAT = Format(
     write=write,
     bounds=bounds,
     holds_motion=True,
+    fits_sequences=True,
     read_options=Splat4dReadOptions,
     write_options=Splat4dOptions,
     presets={
