@@ -192,7 +192,7 @@ def test_evaluation__is_what_the_oracle_makes_of_the_stored_frames(
 
     found = sequence.at(t, interpolation)
 
-    stored = [{name: values for name, values in sequence.frame(i).arrays().items()} for i in range(frames)]
+    stored = [sequence.frame(i).arrays() for i in range(frames)]
     expected = evaluate(stored, t, times, interpolation)
     assert np.allclose(found.means, expected["means"], atol=1e-5)
     assert np.allclose(found.log_scales, expected["log_scales"], atol=1e-4)

@@ -1,6 +1,6 @@
 """Clustering and space-filling orders, slowly and plainly."""
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def best_cuts(values, weights, count):
     for cuts in combinations(range(1, len(values)), count - 1):
         edges = [0, *cuts, len(values)]
         error = 0.0
-        for start, stop in zip(edges, edges[1:], strict=False):
+        for start, stop in pairwise(edges):
             mean = np.average(values[start:stop], weights=weights[start:stop])
             error += float((weights[start:stop] * (values[start:stop] - mean) ** 2).sum())
         least = min(least, error)
