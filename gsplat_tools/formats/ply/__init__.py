@@ -22,9 +22,10 @@ from typing import BinaryIO
 import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.formats._ply_comments import splat_comments
 from gsplat_tools.formats._ply_header import read_header
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, NoOptions
-from gsplat_tools.formats.ply.layout import splat_comments, splat_layout
+from gsplat_tools.formats.ply.layout import splat_layout
 from gsplat_tools.formats.ply.motion import motion_boxes
 from gsplat_tools.formats.ply.reading import ReadOptions, read, read_chunks
 from gsplat_tools.formats.ply.rows import check_rows

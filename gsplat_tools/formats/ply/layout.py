@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
-from typing import Literal, cast
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_tools.attributes.coordinate_systems import is_known
-from gsplat_tools.cloud import REST_COEFFICIENTS, SplatModel, TimeModel
-from gsplat_tools.constants import TEMPORAL_CUTOFF
+from gsplat_tools.cloud import REST_COEFFICIENTS
 from gsplat_tools.errors import CorruptDataError, FormatError
 from gsplat_tools.formats._ply_header import PlyElement, PlyHeader, PlyProperty
 
@@ -31,14 +28,6 @@ MOTION = {
 """Both spellings of each motion property, the one that is written first."""
 
 MOTION_DEFAULTS = {"velocities": 0.0, "times": 0.0, "durations": 1.0}
-
-_MODEL_COMMENTS: dict[tuple[str, str], SplatModel] = {
-    ("splatrendermode", "default"): "default",
-    ("splatrendermode", "mip"): "antialiased",
-    ("splatrendermode", "2dgs"): "2dgs",
-    ("antialiased", "0"): "default",
-    ("antialiased", "1"): "antialiased",
-}
 
 _REST_NAME = re.compile(r"f_rest_([0-9]{1,4})")
 # Positions of these types are exact in float32 as they are.
@@ -102,17 +91,6 @@ class SplatLayout:
                 return None
             columns.append(offset // 4)
         return np.array(columns, np.int64)
-
-
-@dataclass(frozen=True, slots=True)
-class SplatComments:
-    """What comments say about the cloud as a whole."""
-
-    splat_model: SplatModel = "default"
-    coordinate_system: str = "unknown"
-    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    time_model: TimeModel | None = None
-    temporal_cutoff: float = TEMPORAL_CUTOFF
 
 
 def splat_layout(header: PlyHeader) -> SplatLayout:
@@ -205,63 +183,3 @@ def _guess(header: PlyHeader, names: list[str]) -> str:
     if colors & set(names) or set(names) <= {*MEANS, *NORMALS}:
         return "; it looks like a point cloud (the input of a training, not its output)"
     return ""
-
-
-def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
-    """Return what the comments say; comments that are not understood say nothing.
-
-    Parameters
-    ----------
-    header
-        Of the file.
-    is_flat
-        Whether scale_2 is missing, which makes the model "2dgs".
-
-    Raises
-    ------
-    CorruptDataError
-        An origin that is not three finite numbers.
-
-    Source
-    ------
-    `SplatRenderMode: default | mip | 2dgs` is Brush's comment, `antialiased 0 | 1` is Postshot's; the last one wins, as in
-    splat-transform. origin, coordinate_system, time_model and temporal_cutoff are ours.
-    """
-    model: SplatModel = "default"
-    system, origin = "unknown", np.zeros(3)
-    time_model: TimeModel | None = None
-    cutoff = TEMPORAL_CUTOFF
-    for comment in header.comments:
-        words = comment.replace(":", " ").split()
-        key, values = (words[0].lower(), words[1:]) if words else ("", [])
-        if key in {"splatrendermode", "antialiased"} and len(values) == 1:
-            model = _MODEL_COMMENTS.get((key, values[0].lower()), model)
-        elif key == "coordinate_system" and len(values) == 1 and is_known(values[0]):
-            system = values[0]
-        elif key == "time_model" and values in (["window"], ["gaussian"]):
-            time_model = cast("Literal['window', 'gaussian']", values[0])
-        elif key == "origin" and len(values) == 3:
-            origin = _origin(values, origin)
-        elif key == "temporal_cutoff" and len(values) == 1:
-            cutoff = _cutoff(values[0], cutoff)
-    return SplatComments("2dgs" if is_flat else model, system, origin, time_model, cutoff)
-
-
-def _cutoff(word: str, otherwise: float) -> float:
-    """Parse a cutoff comment; a word that is no number between 0 and 1 is somebody else's comment."""
-    try:
-        cutoff = float(word)
-    except ValueError:
-        return otherwise
-    return cutoff if 0 < cutoff < 1 else otherwise
-
-
-def _origin(words: list[str], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Parse the numbers of an origin comment; words that are no numbers are somebody else's comment."""
-    try:
-        origin = np.array([float(word) for word in words])
-    except ValueError:
-        return otherwise
-    if not np.isfinite(origin).all():
-        raise CorruptDataError(f"expected three finite numbers, found {' '.join(words)!r}", field="comment origin")
-    return origin

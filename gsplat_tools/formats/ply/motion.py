@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.attributes.motion import Box, MotionBox
+from gsplat_tools.formats._ply_comments import SplatComments
 from gsplat_tools.formats._ply_header import PlyHeader
-from gsplat_tools.formats.ply.layout import MEANS, MOTION_DEFAULTS, SplatComments, SplatLayout
+from gsplat_tools.formats.ply.layout import MEANS, MOTION_DEFAULTS, SplatLayout
 from gsplat_tools.formats.ply.rows import open_rows
 from gsplat_tools.parallel import blocks
 

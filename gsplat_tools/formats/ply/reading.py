@@ -15,8 +15,9 @@ from gsplat_tools.chunks import CHUNK_SIZE, CloudChunks
 from gsplat_tools.cloud import GaussianCloud, TimeModel, empty_cloud
 from gsplat_tools.errors import LossyConversionWarning
 from gsplat_tools.formats._motion_repair import MotionRepair
+from gsplat_tools.formats._ply_comments import SplatComments, splat_comments
 from gsplat_tools.formats._ply_header import PlyHeader, read_header
-from gsplat_tools.formats.ply.layout import MEANS, MOTION_DEFAULTS, SplatComments, SplatLayout, splat_comments, splat_layout
+from gsplat_tools.formats.ply.layout import MEANS, MOTION_DEFAULTS, SplatLayout, splat_layout
 from gsplat_tools.formats.ply.rows import Rows, open_rows
 from gsplat_tools.parallel import blocks, map_ordered, run_blocks
 

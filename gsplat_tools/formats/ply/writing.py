@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.constants import TEMPORAL_CUTOFF
 from gsplat_tools.errors import CapabilityError, LossyConversionWarning
+from gsplat_tools.formats._ply_comments import comment_lines
 from gsplat_tools.formats.base import NoOptions
 from gsplat_tools.formats.ply.layout import MEANS, MOTION, OPACITY, QUATS, SCALES, SH0
 from gsplat_tools.parallel import run_blocks
@@ -120,19 +120,7 @@ def _check_names(splat_names: set[str], motion_names: list[str], names: list[str
 
 def _header(template: GaussianCloud, count: int, splat_names: list[str], tail: list[tuple[str, np.dtype[Any]]]) -> bytes:
     """Return the header; the metadata stands in comments."""
-    lines = ["ply", "format binary_little_endian 1.0"]
-    if template.splat_model == "antialiased":
-        lines += ["comment SplatRenderMode: mip", "comment antialiased 1"]
-    elif template.splat_model == "2dgs":
-        lines.append("comment SplatRenderMode: 2dgs")
-    if template.coordinate_system != "unknown":
-        lines.append(f"comment coordinate_system {template.coordinate_system}")
-    if template.origin.any():
-        lines.append("comment origin " + " ".join(repr(float(value)) for value in template.origin))
-    if template.has_motion and template.time_model != "window":
-        lines.append(f"comment time_model {template.time_model}")
-        if template.temporal_cutoff != TEMPORAL_CUTOFF:
-            lines.append(f"comment temporal_cutoff {template.temporal_cutoff!r}")
+    lines = ["ply", "format binary_little_endian 1.0", *comment_lines(template)]
     lines.append(f"element vertex {count}")
     lines += [f"property float {name}" for name in splat_names]
     lines += [f"property {_TYPE_NAMES[dtype.str[1:]]} {name}" for name, dtype in tail]
