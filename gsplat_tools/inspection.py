@@ -14,6 +14,7 @@ from gsplat_tools.attributes import activations
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import compare_with_pictures, still
 from gsplat_tools.constants import VISIBLE_OPACITY
+from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats.base import FileInfo, Format
 from gsplat_tools.formats.loading import inspect_file, load, open_scene
@@ -23,6 +24,9 @@ from gsplat_tools.sequence import GaussianSequence
 
 if TYPE_CHECKING:
     from gsplat_tools.reference.camera import Camera
+
+ANIMATED_TIMES = 31
+"""Moments of an animation where none are named."""
 
 PERCENTILES = (0.1, 1, 5, 25, 50, 75, 95, 99, 99.9)
 HISTOGRAM_BINS = 32
@@ -257,27 +261,30 @@ def compare_files(
 
 def render_file(
     file: Path,
-    target: Path,
+    target: Path | None,
     *,
     camera: str,
-    views: int,
+    views: int | None,
     model: str | None,
     variant: str | None,
     size: tuple[int, int],
     t: float | None,
     framebuffer: Any,
     overwrite: bool,
+    times: Sequence[float] | None = None,
+    animate: Path | None = None,
+    fps: float = 15.0,
 ) -> dict[str, Any]:
-    """Draw a file into a PNG and return what was drawn.
+    """Draw a file into a PNG, an animated WebP or both, and return what was drawn.
 
     Parameters
     ----------
     file, target
-        Scene and picture.
+        Scene and picture; no picture where `target` is None.
     camera
         "auto" or a file of cameras.
     views, size
-        Automatic views and their size, px; several views make a contact sheet.
+        Automatic views and their size, px; several views make a contact sheet. By default 8 at one time, 1 over time.
     model, variant
         Rendering model; by default that of the file's format.
     t
@@ -286,6 +293,10 @@ def render_file(
         "float", or "unorm8" to round after every blend.
     overwrite
         Replace a picture that is there.
+    times
+        Several times: a row of the contact sheet is a view, a column a time. With `animate`, 31 from 0 to 1 by default.
+    animate, fps
+        Animated WebP of the times, and its pictures a second.
 
     Raises
     ------
@@ -293,25 +304,55 @@ def render_file(
         The bytes of a file are at fault.
     TargetExistsError
         The picture is there and `overwrite` is false.
+    CapabilityError
+        Both a time and several are given, or there is nothing to write.
     """
     from gsplat_tools.reference.pictures import contact_sheet
     from gsplat_tools.reference.rasterizer import render
 
+    if (t is not None and times is not None) or (target is None and animate is None):
+        raise CapabilityError("give one time or several, and a picture or an animation to write")
     scene, (name, default_variant) = _load_with_model(file, model)
-    cloud = still(scene, t)
-    cameras = _cameras(cloud, None if camera == "auto" else Path(camera), views, size)
+    moments: Sequence[float | None] = times or (np.linspace(0, 1, ANIMATED_TIMES).tolist() if animate and t is None else [t])
+    shown_views = views or (8 if len(moments) == 1 else 1)
+    # One set of cameras for all times, round what is there in the middle.
+    middle = still(scene, moments[len(moments) // 2])
+    cameras = _cameras(middle, None if camera == "auto" else Path(camera), shown_views, size)
     drawn = []
-    with stage("rendering", len(cameras), "views") as progress:
-        for one in cameras:
-            drawn.append(render(cloud, one, model=name, variant=variant or default_variant, t=t, framebuffer=framebuffer))
-            progress.advance(1)
-    _write_png(contact_sheet([rendering.image for rendering in drawn]), target, overwrite=overwrite)
+    with stage("rendering", len(cameras) * len(moments), "views") as progress:
+        for moment in moments:
+            cloud = still(scene, moment)
+            for one in cameras:
+                options: dict[str, Any] = {"variant": variant or default_variant, "framebuffer": framebuffer}
+                drawn.append(render(cloud, one, model=name, t=moment, **options))
+                progress.advance(1)
+    pictures = [rendering.image for rendering in drawn]
+    by_time = [pictures[start : start + len(cameras)] for start in range(0, len(pictures), len(cameras))]
+    if target is not None:
+        by_view = [picture for row in zip(*by_time, strict=True) for picture in row]
+        columns = len(moments) if len(moments) > 1 else None
+        _write_png(contact_sheet(by_view, columns=columns), target, overwrite=overwrite)
+    if animate is not None:
+        _write_animation([contact_sheet(row) for row in by_time], animate, fps=fps, overwrite=overwrite)
     return {
-        "picture": str(target),
+        "picture": None if target is None else str(target),
+        "animation": None if animate is None else str(animate),
         "model": name,
         "variant": variant or default_variant,
+        "times": list(moments),
         "views": [asdict(rendering.counts) for rendering in drawn],
     }
+
+
+def _write_animation(pictures: Sequence[NDArray[np.uint8]], path: Path, *, fps: float, overwrite: bool) -> None:
+    """Write 8-bit pictures as an animated WebP that repeats."""
+    from PIL import Image
+
+    first, *rest = [Image.fromarray(picture) for picture in pictures]
+    with replacing(path, overwrite=overwrite) as stream:
+        first.save(
+            stream, format="WEBP", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, quality=90, method=4
+        )
 
 
 def _write_png(picture: NDArray[np.uint8], path: Path, *, overwrite: bool) -> None:

@@ -170,15 +170,25 @@ def compare(
 
 @main.command()
 @click.argument("file", type=options.EXISTING_FILE)
-@click.option("-o", "--output", "target", type=click.Path(dir_okay=False, path_type=Path), required=True, help="PNG to write.")
+@click.option("-o", "--output", "target", type=click.Path(dir_okay=False, path_type=Path), help="PNG to write.")
 @click.option("--camera", default="auto", show_default=True, metavar="JSON|auto", help="File with a list of cameras.")
 @click.option(
-    "--views", type=click.IntRange(min=1), default=8, show_default=True, help="Automatic views; several make a contact sheet."
+    "--views",
+    type=click.IntRange(min=1),
+    help="Automatic views; several make a contact sheet. By default 8, or 1 with --times or --animate.",
 )
 @click.option("--model", type=click.Choice(options.MODELS), help="Rendering model; by default the format's.")
 @click.option("--variant", help='Variant of the model: unity "1.0", "1.2.1", "fork-4d"; spark "packed", "ext", "none".')
 @click.option("--size", type=options.SizeType(), default="640x360", show_default=True, help="Size of one view.")
 @click.option("--t", type=float, help="Normalized time at which sequences and motion are evaluated.")
+@click.option("--times", type=options.FrameTimesType(), help="Several times: a row of the picture a view, a column a time.")
+@click.option(
+    "--animate",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="WEBP",
+    help="Write an animated WebP of --times, by default 31 from 0 to 1.",
+)
+@click.option("--fps", type=click.FloatRange(1, 100), default=15, show_default=True, help="Pictures a second of --animate.")
 @click.option(
     "--framebuffer",
     type=click.Choice(["float", "unorm8"]),
@@ -191,11 +201,15 @@ def compare(
 @options.json_option
 @options.progress_option
 @reports_errors
-def render(file: Path, *, target: Path, jobs: int | None, as_json: bool, progress: bool, **given: Any) -> None:
-    """Draw a scene as its target would show it."""
+def render(file: Path, *, target: Path | None, jobs: int | None, as_json: bool, progress: bool, **given: Any) -> None:
+    """Draw a scene as its target would show it, at one time or over time."""
     from gsplat_tools.inspection import render_file
     from gsplat_tools.parallel import use_jobs
 
+    if target is None and given["animate"] is None:
+        raise click.UsageError("give -o, --animate or both")
+    if given["t"] is not None and given["times"]:
+        raise click.UsageError("give --t or --times, not both")
     with use_jobs(jobs), output.showing_progress(progress):
         report = render_file(file, target, **given)
     if as_json:
