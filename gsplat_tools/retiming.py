@@ -124,7 +124,7 @@ def _bake(
     times: Any = motion.frames
     if not target.holds_sequences:
         raise CapabilityError(f"{target.title} holds no sequence; leave out --frames, or take one moment with --time")
-    elif "frame_times" in options:
+    if "frame_times" in options:
         times = options.pop("frame_times")
         if motion.frames not in (None, len(times)):
             raise CapabilityError(f"--frames is {motion.frames} and --frame-times names {len(times)}; give one of them")

@@ -38,8 +38,8 @@ class MotionResiduals:
         (N,) natural logarithm, over the frames that show it; inf where an axis is flat in some of them only.
     rotation_max
         (N,) radians, over the frames that show it.
-    sh0_rms
-        (N,) coefficient of the constant SH term, over the frames that show it.
+    sh0_rms, shN_rms
+        (N,) SH coefficients, over the frames that show it.
     """
 
     splats: NDArray[np.intp]
@@ -51,13 +51,19 @@ class MotionResiduals:
     log_scale_rms: Float64
     rotation_max: Float64
     sh0_rms: Float64
+    shN_rms: Float64
 
     def summary(self) -> str:
         """Return the residuals in one line for people."""
         if len(self.splats) == 0:
             return "no splat to fit"
         parts = []
-        for name, values in (("position", self.position_rms), ("opacity", self.opacity_rms), ("log scale", self.log_scale_rms)):
+        for name, values in (
+            ("position", self.position_rms),
+            ("opacity", self.opacity_rms),
+            ("log scale", self.log_scale_rms),
+            ("SH", self.shN_rms),
+        ):
             middle, high = np.quantile(values, [0.5, 0.99], method="nearest")
             parts.append(f"{name} {middle:.3g} (99 %: {high:.3g})")
         turn = np.degrees(np.quantile(self.rotation_max, 0.99, method="nearest"))
@@ -244,7 +250,7 @@ class _Residuals:
     opacity_squares: Float64 = field(init=False)
 
     def __post_init__(self) -> None:
-        names = ("position", "position_max", "opacity_max", "log_scale", "rotation", "sh0")
+        names = ("position", "position_max", "opacity_max", "log_scale", "rotation", "sh0", "shN")
         self.sums = {name: np.zeros(len(self.cloud)) for name in names}
         self.opacity_squares = np.zeros(len(self.cloud))
 
@@ -270,6 +276,7 @@ class _Residuals:
             stretch = np.where(same, 0.0, cloud.log_scales.astype(np.float64) - frame.log_scales)
             sums["log_scale"] += np.where(shown, np.square(stretch).sum(axis=1), 0.0)
         sums["sh0"] += np.square(cloud.sh0.astype(np.float64) - frame.sh0).sum(axis=1) * shown
+        sums["shN"] += np.square(cloud.shN.astype(np.float64) - frame.shN).sum(axis=(1, 2)) * shown
         np.maximum(sums["rotation"], _angles(cloud.quats, frame.quats) * shown, out=sums["rotation"])
 
     def finish(self, splats: NDArray[np.intp], visible: NDArray[np.int64], num_frames: int) -> MotionResiduals:
@@ -284,6 +291,7 @@ class _Residuals:
             log_scale_rms=np.sqrt(self.sums["log_scale"] / visible / 3),
             rotation_max=self.sums["rotation"],
             sh0_rms=np.sqrt(self.sums["sh0"] / visible / 3),
+            shN_rms=np.sqrt(self.sums["shN"] / visible / max(3 * self.cloud.shN.shape[1], 1)),
         )
 
 
