@@ -179,7 +179,8 @@ def compose_image(
     image = np.ascontiguousarray(np.moveaxis(inside[1:], 0, 2))
     alphas = 1 - transmittance
     if model.front_to_back:
-        image += transmittance[:, :, None] * backdrop.astype(planes.dtype)
+        if backdrop.any():
+            image += transmittance[:, :, None] * backdrop.astype(planes.dtype)
         if quantizes:
             image, alphas = (np.rint(np.clip(values, 0, 1) * 255) / 255 for values in (image, alphas))
     return image.astype(planes.dtype, copy=False), alphas.astype(planes.dtype, copy=False)
