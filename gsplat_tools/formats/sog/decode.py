@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import GsplatWarning
+from gsplat_tools.errors import CapabilityError, GsplatWarning
 from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats.sog.bundle import Bundle, check_indices, open_bundle
 from gsplat_tools.formats.sog.lod import parse_lod
 from gsplat_tools.formats.sog.options import SogReadOptions
-from gsplat_tools.formats.sog.rules import fault
 from gsplat_tools.parallel import map_ordered
 
 Float32 = NDArray[np.float32]
@@ -34,6 +33,8 @@ def read(stream: BinaryIO, options: SogReadOptions) -> GaussianCloud:
     ------
     FormatError
         A rule of docs/formats/sog.md is broken.
+    CapabilityError
+        There is no such level.
 
     Warns
     -----
@@ -43,7 +44,7 @@ def read(stream: BinaryIO, options: SogReadOptions) -> GaussianCloud:
     bundle, folder = open_bundle(stream)
     if bundle is not None:
         if options.lod > 0:
-            raise fault("lod-level", f"expected level 0 of a scene without levels, found {options.lod}")
+            raise CapabilityError(f"this scene has no levels of detail but 0, got lod={options.lod}")
         return decode(bundle)
     assert folder is not None
     return parse_lod(stream.read(), folder).read(options.lod, decode)

@@ -53,11 +53,11 @@ class LodScene:
 
         Raises
         ------
-        CorruptDataError
+        CapabilityError
             There is no such level.
         """
         if not 0 <= level < len(self.levels):
-            raise fault("lod-level", f"expected a level in 0..{len(self.levels) - 1}, found {level}", LOD_NAME)
+            raise CapabilityError(f"expected a level in 0..{len(self.levels) - 1}, got lod={level}", field=LOD_NAME)
         return self.levels[level]
 
     def bundles(self, level: int) -> Iterator[tuple[Bundle, list[Piece]]]:
@@ -75,7 +75,9 @@ class LodScene:
         Raises
         ------
         FormatError
-            The level or a bundle is missing or broken, or bundles differ in what they hold.
+            A bundle is missing or broken.
+        CapabilityError
+            There is no such level, or its bundles are of several splat models.
         """
         from gsplat_tools.ops.harmonics import with_sh_degree
 

@@ -45,7 +45,6 @@ RULES: dict[str, Rule] = {
     "image-size": _error("Every image has a pixel for every splat."),
     "image-limit": Rule(severity="error", meaning="Images claim no more than the file can hold.", error=LimitExceededError),
     "lod-tree": _error("The tree of lod-meta.json refers to files, levels and rows that are there."),
-    "lod-level": _error("The level that is asked for exists."),
     "label-range": Rule(severity="warning", meaning="SH labels are below the number of palette entries; others give no SH."),
     "unknown-model": Rule(severity="warning", meaning='"model" is "default", "antialiased" or "2dgs"; others read as default.'),
     "model-conflict": Rule(severity="warning", meaning='"model" and "antialias" say the same.'),
