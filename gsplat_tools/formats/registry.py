@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsplat_tools.errors import CapabilityError, UnknownFormatError
-from gsplat_tools.formats import ply, sog, sog4d, splat4d, spz
+from gsplat_tools.formats import compressed_ply, ply, sog, sog4d, splat, splat4d, spz
 from gsplat_tools.formats.base import SNIFF_BYTES, Format
 from gsplat_tools.formats.pack import gscc, spark, uncompressed
 
 _MODULES: tuple[Format, ...] = (
+    compressed_ply.FORMAT,
     ply.FORMAT,
     spark.FORMAT,
     uncompressed.FORMAT,
@@ -17,6 +18,7 @@ _MODULES: tuple[Format, ...] = (
     sog.FORMAT,
     sog4d.FORMAT,
     spz.FORMAT,
+    splat.FORMAT,
     splat4d.FORMAT,
 )
 

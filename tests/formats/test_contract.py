@@ -41,6 +41,11 @@ def read(path: Path, record: Format) -> GaussianCloud:
             return scene
 
 
+def is_headerless(record: Format, whole: bytes) -> bool:
+    """Whether files are arrays of records, which nothing but their length says anything about."""
+    return len(whole) % 5 == 0 and not record.matches(whole)
+
+
 def prepared(cloud: GaussianCloud, record: Format) -> GaussianCloud:
     """What a writer is given: the axes of a format that is always in one system."""
     from gsplat_tools.formats.preparing import SaveChoices, prepare
@@ -106,6 +111,8 @@ def test_prefix__is_refused_at_every_length(record: Format, tmp_path: Path) -> N
     assert len(whole) < 20_000
 
     for length in range(len(whole)):
+        if is_headerless(record, whole) and length and length % (len(whole) // 5) == 0:
+            continue  # a shorter array of records is a file of its own
         path.write_bytes(whole[:length])
         with pytest.raises(GsplatError) as caught:
             read(path, record)
@@ -143,7 +150,7 @@ def test_changed_byte__is_refused_or_read_and_nothing_else(record: Format, tmp_p
                 outcomes.add("read")
             except GsplatError:
                 outcomes.add("refused")
-    assert "refused" in outcomes
+    assert "refused" in outcomes or is_headerless(record, whole)
 
 
 @every_format

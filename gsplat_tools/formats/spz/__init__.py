@@ -65,7 +65,7 @@ class SpzOptions:
     """
 
     version: int = 4
-    rotation: Rotation = "best"
+    rotation: Rotation = "small"
     sh1_bits: int = 5
     sh_rest_bits: int = 4
     fractional_bits: attributes.FractionalBits = "auto"
@@ -268,7 +268,14 @@ FORMAT = Format(
     presets={
         "fast": {"level": 3},
         "balanced": {},
-        "best": {"level": 19, "sh1_bits": 8, "sh_rest_bits": 8, "fractional_bits": "finest"},
+        "best": {
+            "level": 19,
+            "rotation": "best",
+            "sh1_bits": 8,
+            "sh_rest_bits": 8,
+            "fractional_bits": "finest",
+            "order": "morton",
+        },
     },
     model=("spark", None),
 )
