@@ -30,7 +30,7 @@ def _requantize_rotation(splats, row, axis_steps, angle_steps):
         w, x, y, z = -w, -x, -y, -z
     sine = np.sqrt(x * x + y * y + z * z)
     # Not acos of w: near the identity that is 1 - w, rounded.
-    angle = two * math.atan2(sine, w)
+    angle = f(2.0 * math.atan2(np.float64(sine), np.float64(w)))
     if sine < f(_MIN_SIN):
         x, y, z = one, f(0), f(0)
     total = abs(x) + abs(y) + abs(z)
@@ -46,8 +46,8 @@ def _requantize_rotation(splats, row, axis_steps, angle_steps):
     fold = max(-pz, f(0))
     px += -fold if px >= f(0) else fold
     py += -fold if py >= f(0) else fold
-    scale = math.sin(half * angle) / np.sqrt(px * px + py * py + pz * pz)
-    splats[row, R.QUAT] = math.cos(half * angle)
+    scale = f(math.sin(0.5 * np.float64(angle))) / np.sqrt(px * px + py * py + pz * pz)
+    splats[row, R.QUAT] = f(math.cos(0.5 * np.float64(angle)))
     splats[row, R.QUAT + 1] = px * scale
     splats[row, R.QUAT + 2] = py * scale
     splats[row, R.QUAT + 3] = pz * scale
@@ -72,9 +72,9 @@ def requantize(splats, eye, form):
                 splats[row, R.COLOR + c] = np.floor(color * bytes_ + half) / bytes_
                 scale = splats[row, R.SCALE + c]
                 if scale > zero and scale < f(np.inf):
-                    code = np.floor((np.log(scale) - f(_LN_MIN)) * f(_LN_STEPS / _LN_RANGE) + half)
-                    code = min(max(code, zero), f(_LN_STEPS))
-                    splats[row, R.SCALE + c] = f(math.exp(_LN_MIN + np.float64(code) * (_LN_RANGE / _LN_STEPS)))
+                    code = np.floor((math.log(np.float64(scale)) - _LN_MIN) * (_LN_STEPS / _LN_RANGE) + 0.5)
+                    code = min(max(code, 0.0), _LN_STEPS)
+                    splats[row, R.SCALE + c] = f(math.exp(_LN_MIN + code * (_LN_RANGE / _LN_STEPS)))
             # Half the opacity in 8 bits, so that opacities up to 2 fit.
             splats[row, R.OPACITY] = np.floor(half * splats[row, R.OPACITY] * bytes_ + half) / bytes_ * f(2)
             _requantize_rotation(splats, row, bytes_, bytes_)
@@ -84,6 +84,6 @@ def requantize(splats, eye, form):
                 splats[row, R.COLOR + c] = f(round_to_half(splats[row, R.COLOR + c]))
                 scale = splats[row, R.SCALE + c]
                 if scale > zero and scale < f(np.inf):
-                    splats[row, R.SCALE + c] = f(math.exp(np.float64(round_to_half(np.log(scale)))))
+                    splats[row, R.SCALE + c] = f(math.exp(np.float64(round_to_half(math.log(np.float64(scale))))))
             splats[row, R.OPACITY] = f(round_to_half(splats[row, R.OPACITY]))
             _requantize_rotation(splats, row, f(1023), f(4095))
