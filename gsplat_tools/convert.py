@@ -242,7 +242,7 @@ def _validate(
     pairs = [pair for pair in pairs if len(pair[1])]
     if pairs and how.views > 0:
         cameras = auto_cameras(pairs[0][1], views=how.views, size=how.size)
-        report, _ = compare_rendered(pairs, cameras, model)
+        report = compare_rendered(pairs, cameras, model, num_pairs=len(pairs))
         result = {name: getattr(report, name) for name in ("psnr_min", "psnr_mean", "ssim_mean", "max_abs", "identical")}
         result |= {"worst_view": report.worst_view, "model": report.model, "rendered_splats": report.rendered_splats}
     exceeded = tally.exceeded()

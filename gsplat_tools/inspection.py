@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from gsplat_tools.attributes import activations
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.comparison import compare_with_pictures, still
+from gsplat_tools.comparison import common_frames, compare, frame_levels, still
 from gsplat_tools.constants import VISIBLE_OPACITY
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats.base import FileInfo, Format
 from gsplat_tools.formats.loading import inspect_file, load, open_scene
+from gsplat_tools.formats.sequences import open_sequence
 from gsplat_tools.ops.recentering import position_step
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
@@ -203,6 +204,9 @@ def _overdraw_hint(cloud: GaussianCloud) -> list[Hint]:
 
 def _load_with_model(path: Path, model: str | None) -> tuple[GaussianCloud | GaussianSequence, tuple[str, str | None]]:
     """Return a scene and the model that draws it: the one asked for, or that of its format."""
+    if path.is_dir():
+        sequence = open_sequence(path)
+        return sequence, ("inria", None) if model is None else (model, None)
     record, _ = inspect_file(path)
     return load(path), record.model if model is None else (model, None)
 
@@ -231,7 +235,7 @@ def compare_files(
     Parameters
     ----------
     reference, candidate
-        Files to compare.
+        Files to compare, or folders of frames.
     views, size, camera_file
         Automatic views and their size, px; or a file of cameras.
     model
@@ -251,12 +255,17 @@ def compare_files(
     scene, _ = _load_with_model(reference, model)
     other, (name, variant) = _load_with_model(candidate, model)
     cameras = _cameras(still(scene, t), camera_file, views, size)
-    report, pictures = compare_with_pictures(scene, other, cameras=cameras, model=name, variant=variant, t=t)
+
+    def see(view: str, a: NDArray[Any], b: NDArray[Any]) -> None:
+        assert images is not None
+        path = images / f"{view.replace(' ', '_')}.png"
+        _write_png(contact_sheet([a, b, difference_picture(a, b)], columns=3), path, overwrite=True)
+
     if images is not None:
         images.mkdir(parents=True, exist_ok=True)
-        for index, (a, b) in enumerate(pictures):
-            _write_png(contact_sheet([a, b, difference_picture(a, b)], columns=3), images / f"view_{index}.png", overwrite=True)
-    return asdict(report)
+    report = compare(scene, other, cameras=cameras, model=name, variant=variant, t=t, see=None if images is None else see)
+    frames = common_frames(scene, other) if t is None else 1
+    return {**asdict(report), "frames": frame_levels(report, frames) if frames > 1 else []}
 
 
 def render_file(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -98,8 +99,8 @@ def stats(file: Path, *, frame: int, as_json: bool) -> None:
 
 
 @main.command()
-@click.argument("reference", type=options.EXISTING_FILE)
-@click.argument("candidate", type=options.EXISTING_FILE)
+@click.argument("reference", type=click.Path(exists=True, path_type=Path))
+@click.argument("candidate", type=click.Path(exists=True, path_type=Path))
 @click.option("--views", type=click.IntRange(min=1), default=8, show_default=True, help="Automatic views.")
 @click.option("--size", type=options.SizeType(), default="640x360", show_default=True, help="Size of the pictures.")
 @click.option("--camera", type=options.EXISTING_FILE, help="JSON list of cameras instead of automatic views.")
@@ -129,7 +130,10 @@ def compare(
     as_json: bool,
     progress: bool,
 ) -> None:
-    """Compare two files by their attributes and by what a target would show."""
+    """Compare two files, or folders of frames, by their attributes and by what a target would show.
+
+    Sequences of the same length are compared frame by frame, or at one time with --t.
+    """
     from gsplat_tools.inspection import compare_files
     from gsplat_tools.parallel import use_jobs
 
@@ -159,6 +163,11 @@ def compare(
         for view in report["views"]
     ]
     click.echo(output.table(rows, ("view", "PSNR dB", "SSIM", "max error", "% > 1/255", "% > 8/255")))
+    if report["frames"]:
+        worst = min(report["frames"], key=lambda level: math.inf if level["psnr_min"] is None else level["psnr_min"])
+        rows = [(str(f["frame"]), output.number(f["psnr_min"]), output.number(f["psnr_mean"])) for f in report["frames"]]
+        click.echo(output.table(rows, ("frame", "PSNR min", "PSNR mean")))
+        click.echo(f"worst frame: {worst['frame']}")
     if report["identical"]:
         click.echo(f"{report['model']}: the pictures are identical")
     else:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ MAX_RENDERED = 250_000
 """Splats of a scene in chunks that are rendered: every k-th of a larger one, so that memory stays bounded."""
 
 Picture = NDArray[np.floating[Any]]
+See = Callable[[str, Picture, Picture], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,41 +96,45 @@ def sample(scene: GaussianCloud | CloudChunks, limit: int = MAX_RENDERED) -> Gau
 
 
 def compare_rendered(
-    pairs: Sequence[tuple[str, GaussianCloud, GaussianCloud]],
+    pairs: Iterable[tuple[str, GaussianCloud, GaussianCloud]],
     cameras: Sequence[Camera],
     model: tuple[str, str | None],
     *,
+    num_pairs: int = 1,
     t: float | None = None,
-    attributes: Mapping[str, Mapping[str, float | int | None]] | None = None,
-) -> tuple[ComparisonReport, list[tuple[Picture, Picture]]]:
+    see: See | None = None,
+) -> ComparisonReport:
     """Draw both sides from every camera and measure the difference.
 
     Parameters
     ----------
     pairs
-        (label, reference, candidate); one pair for a still scene, one a frame for sequences.
+        (label, reference, candidate); one pair for a still scene, one a frame for sequences; gone through once.
     cameras
         Views of each pair.
     model
         Rendering model and variant, the same for both sides.
+    num_pairs
+        Number of pairs, for the progress shown.
     t
         Time at which motion is evaluated.
-    attributes
-        Attribute errors to put into the report.
+    see
+        Called with the name of each view and both pictures.
 
     Returns
     -------
-    tuple
-        The report, and the pictures of reference and candidate per view.
+    ComparisonReport
+        Without attributes.
     """
     from gsplat_tools.reference import image_metrics
     from gsplat_tools.reference.rasterizer import render
 
     name, variant = model
     views: list[ViewReport] = []
-    pictures = []
-    with stage("rendering", 2 * len(pairs) * len(cameras), "views") as progress:
+    rendered = 0
+    with stage("rendering", 2 * num_pairs * len(cameras), "views") as progress:
         for label, reference, candidate in pairs:
+            rendered = max(rendered, len(reference))
             for index, camera in enumerate(cameras):
                 images = []
                 for cloud in (reference, candidate):
@@ -147,30 +152,30 @@ def compare_rendered(
                         share_above_8=metrics.share_above_8,
                     )
                 )
-                pictures.append((images[0], images[1]))
+                if see is not None:
+                    see(views[-1].name, images[0], images[1])
     levels = [view.psnr for view in views if view.psnr is not None]
     similarities = [view.ssim for view in views if view.ssim is not None]
     worst = min(views, key=lambda view: np.inf if view.psnr is None else view.psnr)
-    report = ComparisonReport(
+    return ComparisonReport(
         psnr_min=min(levels) if levels else None,
         psnr_mean=float(np.mean(levels)) if levels else None,
         ssim_mean=float(np.mean(similarities)) if similarities else None,
         max_abs=max(view.max_abs for view in views),
         identical=not levels,
         worst_view=worst.name,
-        attributes=attributes or {},
+        attributes={},
         views=views,
         model=name if variant is None else f"{name} {variant}",
-        rendered_splats=len(pairs[0][1]),
+        rendered_splats=rendered,
     )
-    return report, pictures
 
 
-def still(scene: GaussianCloud | GaussianSequence, t: float | None) -> GaussianCloud:
-    """Return the cloud of a scene at a time; a sequence without a time gives its first frame as stored."""
+def still(scene: GaussianCloud | GaussianSequence, t: float | None, frame_id: int = 0) -> GaussianCloud:
+    """Return the cloud of a scene at a time; a sequence without a time gives one frame as stored."""
     if isinstance(scene, GaussianCloud):
         return scene
-    return scene.frame(0) if t is None else scene.at(t)
+    return scene.frame(frame_id) if t is None else scene.at(t)
 
 
 def compare(
@@ -183,6 +188,7 @@ def compare(
     variant: str | None = None,
     t: float | None = None,
     cameras: Sequence[Camera] | None = None,
+    see: See | None = None,
 ) -> ComparisonReport:
     """Compare two scenes by their attributes and by what a target would show.
 
@@ -190,48 +196,65 @@ def compare(
     ----------
     reference, candidate
         Scenes; attributes are compared where both have the same splats (matched by position if their order differs).
+        Two sequences of the same length are compared frame by frame.
     views
-        Number of automatic views of the reference.
+        Number of automatic views of the reference, of each frame.
     size
         Width and height of the pictures, px.
     model, variant
         Rendering model; "inria" by default.
     t
-        Normalized time at which sequences and motion are evaluated.
+        Normalized time at which sequences and motion are evaluated, instead of all frames.
     cameras
         Views to use instead of automatic ones.
+    see
+        Called with the name of each view and both pictures.
 
     Returns
     -------
     ComparisonReport
         PSNR of both pictures clamped to [0, 1], peak 1, on black.
     """
-    return compare_with_pictures(
-        reference, candidate, views=views, size=size, model=model, variant=variant, t=t, cameras=cameras
-    )[0]
-
-
-def compare_with_pictures(
-    reference: GaussianCloud | GaussianSequence,
-    candidate: GaussianCloud | GaussianSequence,
-    *,
-    views: int = 8,
-    size: tuple[int, int] = (640, 360),
-    model: str | None = None,
-    variant: str | None = None,
-    t: float | None = None,
-    cameras: Sequence[Camera] | None = None,
-) -> tuple[ComparisonReport, list[tuple[Picture, Picture]]]:
-    """Return what `compare` returns and the pairs of pictures it is about."""
     from gsplat_tools.reference.auto_cameras import auto_cameras
 
-    first, second = still(reference, t), still(candidate, t)
-    chosen = list(cameras) if cameras is not None else auto_cameras(first, views=views, size=size)
-    attributes = {}
-    matched = match_splats(first, second)
-    if matched is not None:
-        tally = AttributeTally()
-        for a, b in paired(first, second if isinstance(matched, slice) else second.take(matched)):
-            tally.add(a, b)
-        attributes = tally.to_json()
-    return compare_rendered([("", first, second)], chosen, (model or "inria", variant), t=t, attributes=attributes)
+    count = common_frames(reference, candidate) if t is None else 1
+    tally = AttributeTally()
+
+    def pairs() -> Iterator[tuple[str, GaussianCloud, GaussianCloud]]:
+        matched: slice | NDArray[np.intp] | None = None
+        for frame_id in range(count):
+            first, second = (still(scene, t, frame_id) for scene in (reference, candidate))
+            if frame_id == 0:
+                matched = match_splats(first, second)
+            if matched is not None:
+                for a, b in paired(first, second if isinstance(matched, slice) else second.take(matched)):
+                    tally.add(a, b)
+            yield f"frame {frame_id} " if count > 1 else "", first, second
+
+    chosen = list(cameras) if cameras is not None else auto_cameras(still(reference, t), views=views, size=size)
+    report = compare_rendered(pairs(), chosen, (model or "inria", variant), num_pairs=count, t=t, see=see)
+    return replace(report, attributes=tally.to_json())
+
+
+def common_frames(reference: GaussianCloud | GaussianSequence, candidate: GaussianCloud | GaussianSequence) -> int:
+    """Return the number of frames that are compared: all of two sequences of one length, else the first."""
+    if isinstance(reference, GaussianSequence) and isinstance(candidate, GaussianSequence):
+        return len(reference) if len(reference) == len(candidate) else 1
+    return 1
+
+
+def frame_levels(report: ComparisonReport, frames: int) -> list[dict[str, float | int | None]]:
+    """Return the lowest and the mean PSNR of every frame; None where a frame is identical in every view."""
+    per_frame = len(report.views) // frames
+    levels: list[dict[str, float | int | None]] = []
+    for frame_id in range(frames):
+        found = [view.psnr for view in report.views[frame_id * per_frame : (frame_id + 1) * per_frame]]
+        known = [level for level in found if level is not None]
+        levels.append(
+            {
+                "frame": frame_id,
+                "psnr_min": min(known) if known else None,
+                "psnr_mean": float(np.mean(known)) if known else None,
+            }
+        )
+    return levels
