@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, ParamSpec, TypeVar
 
 import click
 
-from gsplat_tools.errors import GsplatError
+from gsplat_tools.errors import GsplatError, GsplatWarning
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -23,13 +25,33 @@ def one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
+@contextmanager
+def _showing_warnings() -> Iterator[None]:
+    """Show each of our warnings once, as a line on stderr; leave everyone else's alone."""
+    shown: set[str] = set()
+    show_other = warnings.showwarning
+
+    def show(message: Warning | str, *details: Any, **more: Any) -> None:
+        if not isinstance(message, GsplatWarning):
+            show_other(message, *details, **more)
+        elif str(message) not in shown:
+            shown.add(str(message))
+            click.echo(f"warning: {one_line(message)}", err=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", GsplatWarning)
+        warnings.showwarning = show
+        yield
+
+
 def reports_errors(command: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Turn errors about data into one line on stderr and exit status 1."""
 
     @functools.wraps(command)
     def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         try:
-            return command(*args, **kwargs)
+            with _showing_warnings():
+                return command(*args, **kwargs)
         except GsplatError as error:
             click.echo(f"error: {one_line(error)}", err=True)
         except MemoryError:

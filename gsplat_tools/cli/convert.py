@@ -160,15 +160,19 @@ def main(
     gsplat-convert scene.ply scene.gspk
     gsplat-convert scene.ply scene.sog4d --preset best --min-psnr 40
     gsplat-convert scene.ply out/ --to spark --to sog4d --json
+    gsplat-convert 'frames/*.ply' scene.sog4d
+    gsplat-convert scene.sog4d frames/ --to ply
     """  # noqa: D301 - \b keeps click from joining the lines
     from gsplat_tools.convert import convert
     from gsplat_tools.parallel import use_jobs
 
-    targets = _targets(sources, target, formats)
-    arguments = _arguments(given, [find_target(path, to) for path, to in targets])
     for source in sources:
         if not any(mark in source for mark in "*?[") and not Path(source).exists():
             raise click.UsageError(f"source {source!r} does not exist")
+    targets = _targets(sources, target, formats)
+    arguments = _arguments(given, [find_target(path, to) for path, to in targets])
+    if len(formats) == 1 and target.is_dir() and given["time_at"] is None and given["frame"] is None:
+        targets, arguments = _every_frame(sources, targets[0], arguments[0])
     reports = []
     with use_jobs(jobs), output.showing_progress(progress and not quiet):
         for (path, to), own in zip(targets, arguments, strict=True):
@@ -180,7 +184,7 @@ def main(
                 if not as_json:
                     click.echo(_summary(report.to_json()), err=True)
     if as_json:
-        output.print_json(reports[0] if len(formats) <= 1 else {"conversions": reports})
+        output.print_json(reports[0] if len(reports) == 1 else {"conversions": reports})
 
 
 def _targets(sources: tuple[str, ...], target: Path, formats: tuple[str, ...]) -> list[tuple[Path, str | None]]:
@@ -200,6 +204,23 @@ def _targets(sources: tuple[str, ...], target: Path, formats: tuple[str, ...]) -
         (target / (one if names.count(one) == 1 else f"{stem}.{to}{FORMATS[to].extensions[0]}"), to)
         for one, to in zip(names, formats, strict=True)
     ]
+
+
+def _every_frame(
+    sources: tuple[str, ...], target: tuple[Path, str | None], arguments: dict[str, Any]
+) -> tuple[list[tuple[Path, str | None]], list[dict[str, Any]]]:
+    """Return one target a frame, where the source is a sequence and the target's format holds single frames."""
+    from gsplat_tools.formats.loading import inspect_file
+
+    path, to = target
+    record = find_target(path, to)
+    is_bundle = len(sources) == 1 and Path(sources[0]).is_file()
+    frames = inspect_file(sources[0])[1].frames if is_bundle else 1
+    if frames == 1 or record.holds_sequences:
+        return [target], [arguments]
+    stem = path.name[: -len(record.extensions[0])]
+    names = [path.with_name(f"{stem}_{frame:05d}{record.extensions[0]}") for frame in range(frames)]
+    return [(name, to) for name in names], [{**arguments, "frame": frame} for frame in range(frames)]
 
 
 def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, Any]]:

@@ -187,3 +187,20 @@ def test_convert__stores_an_origin_where_that_gains_precision(tmp_path: Path) ->
     world = auto.origin + auto.means  # type: ignore[union-attr]
     assert np.abs(world - far.means).max() < 4e-3
     assert np.abs(off.means - far.means).max() > 0.5  # type: ignore[union-attr]
+
+
+def test_convert__writes_every_frame_of_a_sequence_into_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    clouds = [random_cloud(50, sh_degree=1, seed=1).replace(opacity_logits=np.full(50, float(i))) for i in range(3)]
+    for i, cloud in enumerate(clouds):
+        save(cloud, tmp_path / "frames" / f"f{i}.ply")
+    (tmp_path / "back").mkdir()
+
+    bundled = run(tmp_path / "frames", tmp_path / "s.sog4d", "--quiet", "--order", "none")
+    unbundled = run(tmp_path / "s.sog4d", tmp_path / "back", "--to", "ply", "--json", "--quiet")
+
+    assert bundled.exit_code == 0
+    assert [r["splats"] for r in json.loads(unbundled.stdout)["conversions"]] == [50, 50, 50]
+    back = [load(tmp_path / "back" / f"s_{i:05d}.ply") for i in range(3)]
+    for cloud, read in zip(clouds, back, strict=True):
+        assert np.abs(cloud.opacity_logits - read.opacity_logits).max() < 0.05  # type: ignore[union-attr]

@@ -109,3 +109,19 @@ def test_inspect__names_what_it_does_not_know(tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert "no format claims this file" in result.stderr
     assert run("polish", tmp_path / "what.bin").exit_code == 2
+
+
+def test_compare__goes_through_the_frames_of_sequences(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    for i in range(3):
+        save(
+            random_cloud(60, sh_degree=0, seed=4).replace(opacity_logits=np.full(60, 2.0 + i)), tmp_path / "frames" / f"{i}.ply"
+        )
+
+    report = json.loads(
+        run("compare", tmp_path / "frames", tmp_path / "frames", "--views", 2, "--size", "48x32", "--json").stdout
+    )
+
+    assert [level["frame"] for level in report["frames"]] == [0, 1, 2]
+    assert [view["name"] for view in report["views"]][:3] == ["frame 0 view 0", "frame 0 view 1", "frame 1 view 0"]
+    assert report["identical"] is True
