@@ -114,7 +114,8 @@ def parse(stream: BinaryIO) -> Contents:
         read_exactly(stream, HEADER.size, field="header")
     )
     if magic != MAGIC or version != 2:
-        raise UnsupportedVersionError(f"expected {MAGIC!r} of version 2, found {magic!r} of version {version}", offset=0)
+        message = f"expected {MAGIC!r} of version 2, found {magic!r} of version {version}"
+        raise UnsupportedVersionError(message, offset=8, field="version")
     for name, offset, expected, found in (("headerSize", 12, 64, header_size), ("recordSize", 20, RECORD_BYTES, record_size)):
         if found != expected:
             raise CorruptDataError(f"expected {expected}, found {found}", offset=offset, field=name)
