@@ -47,6 +47,36 @@ def encode(quats: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     return codes
 
 
+def encode_covariances(
+    quats: NDArray[np.floating[Any]], log_scales: NDArray[np.floating[Any]]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Quantize rotations so that covariances err least: in the best of 24 frames, each component rounded down or up.
+
+    Parameters
+    ----------
+    quats
+        (N, 4) wxyz, finite, of any length; length 0 is taken as the identity.
+    log_scales
+        (N, 3); -inf is flat.
+
+    Returns
+    -------
+    tuple
+        (N, 4) codes, and the frame of each splat (`kernels.rotation_frames`), in which its scales are to be stored.
+    """
+    from gsplat_tools.kernels.quaternion_sog import quantize_covariances
+
+    values, logs = np.ascontiguousarray(quats, np.float32), np.ascontiguousarray(log_scales, np.float32)
+    codes, frames = np.empty(values.shape, np.uint8), np.empty(len(values), np.uint8)
+
+    def choose(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        quantize_covariances(values[part], logs[part], frames[part], codes[part])
+
+    run_blocks(choose, len(values))
+    return codes, frames
+
+
 def decode(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the quaternions wxyz that (N, 4) codes stand for; a tag below 252 is the identity."""
     smaller, largest = _components(codes)
@@ -61,12 +91,13 @@ def decode(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def max_angle(codes: NDArray[np.uint8]) -> float:
-    """Return the largest rotation error that any source of these codes can have, radians.
+    """Return the largest rotation error, radians, of the codes nearest to rotations whose components lie near these.
 
     Parameters
     ----------
     codes
-        (N, 4) as `encode` gives them.
+        (N, 4) as `encode` or `encode_covariances` gives them: each component within a step of its source. Codes that
+        are not the nearest were chosen because their covariance errs less than that of the nearest.
 
     Returns
     -------
@@ -75,13 +106,13 @@ def max_angle(codes: NDArray[np.uint8]) -> float:
 
     Notes
     -----
-    As for `Grid.max_angle`, with the largest component that is stored: three components lie within half a step each,
-    together e, of their source, and the component left out is at least sqrt(1 - (v + e)^2) on the way, v their length.
+    As for `Grid.max_angle`: three components move by half a step each, together by e, and the component left out is at
+    least sqrt(1 - v^2) on the way, v their length, which is at most that of the codes and three steps together.
     """
     smaller, _ = _components(codes)
     moved = np.sqrt(3.0) / (2 * GRID.steps)
-    longest = np.sqrt(np.square(smaller).sum(axis=1).max(initial=0.0))
-    left_out = np.sqrt(max(1 - (longest + moved) ** 2, 0.0))
+    longest = np.sqrt(np.square(smaller).sum(axis=1).max(initial=0.0)) + 2 * moved
+    left_out = np.sqrt(max(1 - longest**2, 0.0))
     return float(min(2 * moved / left_out if left_out > 0 else np.inf, GRID.max_angle))
 
 

@@ -129,3 +129,52 @@ def test_small_frames__leave_w_largest_and_the_bound_low() -> None:
 def test_encode__refuses_what_is_not_finite() -> None:
     with pytest.raises(CloudError, match="1 of 2"):
         quaternion_sog.encode(np.array([[1, 0, 0, 0], [np.nan, 0, 0, 0]]))
+
+
+def covariance(quat: Float64, log_scales: Float64) -> Float64:
+    w, x, y, z = quat.astype(np.float64) / np.linalg.norm(quat.astype(np.float64))
+    axes = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    return np.asarray(axes @ np.diag(np.exp(2 * log_scales.astype(np.float64))) @ axes.T)
+
+
+def test_covariances__err_no_more_than_any_frame_and_rounding_tried_by_hand() -> None:
+    rng = np.random.default_rng(5)
+    quats = random_quats(60, seed=5).astype(np.float32)
+    log_scales = rng.uniform(-3, 0, (60, 3)).astype(np.float32)
+    log_scales[::4, 2] = -np.inf
+
+    codes, frames = quaternion_sog.encode_covariances(quats, log_scales)
+
+    _, relabelled = in_frames(quats, log_scales, frames)
+    decoded = quaternion_sog.decode(codes)
+    for i in range(60):
+        source = covariance(quats[i], log_scales[i])
+        chosen = np.linalg.norm(covariance(decoded[i], relabelled[i]) - source) / np.linalg.norm(source)
+        least = np.inf
+        for frame in range(24):
+            turned, scales = in_frames(quats[i : i + 1], log_scales[i : i + 1], np.array([frame], np.uint8))
+            unit = turned[0].astype(np.float64) / np.linalg.norm(turned[0])
+            unit *= np.sign(unit[np.argmax(np.abs(unit))])
+            tag = int(np.argmax(np.abs(unit)))
+            places = (np.delete(unit, tag) * np.sqrt(2) + 1) * 127.5
+            for corner in range(8):
+                bytes_ = [min(max(int(np.floor(p)) + (corner >> k & 1), 0), 255) for k, p in enumerate(places)]
+                candidate = quaternion_sog.decode(np.array([[*bytes_, 252 + tag]], np.uint8))[0]
+                error = np.linalg.norm(covariance(candidate, scales[0]) - source) / np.linalg.norm(source)
+                least = min(least, float(error))
+        assert chosen <= least * 1.03 + 1e-6  # the choice is by the leading term of the error
+
+
+def test_covariances__a_ball_keeps_the_nearest_code() -> None:
+    quats = random_quats(500, seed=8).astype(np.float32)
+    balls = np.full((500, 3), -2, np.float32)
+
+    codes, frames = quaternion_sog.encode_covariances(quats, balls)
+
+    turned, _ = in_frames(quats, balls, frames)
+    assert angles(turned, quaternion_sog.decode(codes)).max() < np.radians(0.54)
+    np.testing.assert_array_equal(quaternion_sog.encode_covariances(np.zeros((1, 4)), balls[:1])[0], [[128, 128, 128, 252]])

@@ -21,10 +21,11 @@ from gsplat_tools.formats.sog.codebooks import FLAT_STEP, Palette, fit_colors, f
 from gsplat_tools.formats.sog.meta import META_NAME
 from gsplat_tools.formats.sog.options import SogOptions
 from gsplat_tools.formats.sog.rules import PALETTE_COLUMNS
-from gsplat_tools.parallel import map_ordered
+from gsplat_tools.parallel import map_ordered, run_blocks
 from gsplat_tools.progress import stage
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 GENERATOR = "gsplat_tools"
 MAX_SPLATS = 4 * (MAX_SIDE // 4) * 4 * (MAX_SIDE // 4)
@@ -74,7 +75,9 @@ def write(cloud: GaussianCloud, stream: BinaryIO, options: SogOptions) -> None:
     encoded = encode(cloud, options)
 
     def compress(name: str) -> bytes:
-        return _webp.encode_rgba(encoded.images[name], options.webp_effort)
+        # Low position bytes are noise, which more effort hardly shrinks.
+        is_noise = name == "means_l" and 1 <= options.webp_effort <= _webp.DEFAULT_EFFORT
+        return _webp.encode_rgba(encoded.images[name], 1 if is_noise else options.webp_effort)
 
     archive = ZipWriter(stream)
     # The largest first, so that the threads end together; entries keep the order of the format.
@@ -116,21 +119,32 @@ def encode(cloud: GaussianCloud, options: SogOptions) -> Encoded:
     width, height = layout(len(cloud))
     rows = sample_rows(cloud, options.seed)
     weights = np.sqrt(importance(cloud))
-    frames = choose_frames(cloud.quats, cloud.log_scales, quaternion_sog.GRID, options.rotation)
-    quats, log_scales = in_frames(cloud.quats, cloud.log_scales, frames)
-    codes, low, high = position_codes(cloud.means)
+    if options.rotation == "best":
+        rotations, frames = quaternion_sog.encode_covariances(cloud.quats, cloud.log_scales)
+        _, log_scales = in_frames(cloud.quats, cloud.log_scales, frames)
+    else:
+        frames = choose_frames(cloud.quats, cloud.log_scales, quaternion_sog.GRID, options.rotation)
+        quats, log_scales = in_frames(cloud.quats, cloud.log_scales, frames)
+        rotations = quaternion_sog.encode(quats)
+    low, high = (signed_log(cloud.means.min(axis=0)), signed_log(cloud.means.max(axis=0)))
     scales = fit_scales(log_scales, weights, rows)
     colors = fit_colors(cloud.sh0, weights, rows)
-    color_codes = np.empty((len(cloud), 4), np.uint8)
-    color_codes[:, :3] = nearest_entry(cloud.sh0, colors)
-    color_codes[:, 3] = opacity_bytes(cloud.opacity_logits)
-    images = {
-        "means_l": _image(codes & 0xFF, width, height),
-        "means_u": _image(codes >> 8, width, height),
-        "quats": _image(quaternion_sog.encode(quats), width, height),
-        "scales": _image(nearest_entry(log_scales, scales), width, height),
-        "sh0": _image(color_codes, width, height),
-    }
+    images = {name: np.zeros((height, width, 4), np.uint8) for name in ("means_l", "means_u", "quats", "scales", "sh0")}
+    pixels = {name: image.reshape(-1, 4) for name, image in images.items()}
+    for name in ("means_l", "means_u", "scales"):
+        pixels[name][: len(cloud), 3] = 255
+
+    def fill(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        codes = position_codes(cloud.means[part], low, high)
+        pixels["means_l"][part, :3] = codes & 0xFF
+        pixels["means_u"][part, :3] = codes >> 8
+        pixels["quats"][part] = rotations[part]
+        pixels["scales"][part, :3] = nearest_entry(log_scales[part], scales)
+        pixels["sh0"][part, :3] = nearest_entry(cloud.sh0[part], colors)
+        pixels["sh0"][part, 3] = opacity_bytes(cloud.opacity_logits[part])
+
+    run_blocks(fill, len(cloud))
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": f"{GENERATOR} {__version__}"},
@@ -165,13 +179,16 @@ def layout(count: int) -> tuple[int, int]:
     return width, 4 * math.ceil(count / width / 4)
 
 
-def position_codes(means: Float32) -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.float64]]:
-    """Return round(65535 (n - min) / (max - min)) of n = sign(x) ln(1 + |x|), and the range (3,) of n."""
+def signed_log(means: Float32) -> Float64:
+    """Return sign(x) ln(1 + |x|)."""
     wide = means.astype(np.float64)
-    logs = np.copysign(np.log1p(np.abs(wide)), wide)
-    low, high = logs.min(axis=0), logs.max(axis=0)
+    return np.copysign(np.log1p(np.abs(wide)), wide)
+
+
+def position_codes(means: Float32, low: Float64, high: Float64) -> NDArray[np.uint16]:
+    """Return round(65535 (n - min) / (max - min)) of n = sign(x) ln(1 + |x|), 0 on a flat axis."""
     steps = 65535 / np.where(high > low, high - low, 1.0)
-    return np.rint((logs - low) * steps).astype(np.uint16), low, high
+    return np.rint((signed_log(means) - low) * steps).astype(np.uint16)
 
 
 def opacity_bytes(logits: Float32) -> NDArray[np.uint8]:
@@ -184,11 +201,12 @@ def opacity_bytes(logits: Float32) -> NDArray[np.uint8]:
 def palette_images(palette: Palette, width: int, height: int) -> dict[str, Image]:
     """Return the images of centroids, 64 entries a row, and of labels."""
     count, coefficients, _ = palette.indices.shape
-    centroids = _image(palette.indices.reshape(-1, 3), PALETTE_COLUMNS * coefficients, math.ceil(count / PALETTE_COLUMNS))
-    labels = np.zeros((len(palette.labels), 3), np.uint8)
-    labels[:, 0] = palette.labels & 0xFF
-    labels[:, 1] = palette.labels >> 8
-    return {"shN_centroids": centroids, "shN_labels": _image(labels, width, height)}
+    centroids = np.zeros((math.ceil(count / PALETTE_COLUMNS), PALETTE_COLUMNS * coefficients, 4), np.uint8)
+    centroids.reshape(-1, 4)[: count * coefficients] = _opaque(palette.indices.reshape(-1, 3))
+    labels = np.zeros((height, width, 4), np.uint8)
+    halves = np.stack([palette.labels & 0xFF, palette.labels >> 8, np.zeros_like(palette.labels)], axis=1)
+    labels.reshape(-1, 4)[: len(halves)] = _opaque(halves)
+    return {"shN_centroids": centroids, "shN_labels": labels}
 
 
 def meta_text(meta: Mapping[str, Any]) -> bytes:
@@ -201,13 +219,9 @@ def shortest(values: Float32) -> list[float]:
     return [float(str(value)) for value in values]
 
 
-def _image(codes: NDArray[Any], width: int, height: int) -> Image:
-    """Return an image of (N, 3) or (N, 4) bytes, opaque where they are three; what is left over is 0."""
-    image = np.zeros((height * width, 4), np.uint8)
-    image[: len(codes), : codes.shape[1]] = codes
-    if codes.shape[1] == 3:
-        image[: len(codes), 3] = 255
-    return image.reshape(height, width, 4)
+def _opaque(codes: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return (N, 3) bytes with a fourth, 255."""
+    return np.concatenate([codes.astype(np.uint8), np.full((len(codes), 1), 255, np.uint8)], axis=1)
 
 
 def _check(cloud: GaussianCloud) -> None:
@@ -217,8 +231,9 @@ def _check(cloud: GaussianCloud) -> None:
     if cloud.sh_degree > 3:
         raise CapabilityError(f"a SOG bundle holds SH bands up to 3, the scene has {cloud.sh_degree}")
     for name in ("means", "quats", "sh0", "shN"):
-        is_bad = ~np.isfinite(getattr(cloud, name)).reshape(len(cloud), -1).all(axis=1)
-        if is_bad.any():
+        is_finite = np.isfinite(getattr(cloud, name))
+        if not is_finite.all():
+            is_bad = ~is_finite.reshape(len(cloud), -1).all(axis=1)
             raise CloudError(f"{int(is_bad.sum())} of {len(cloud)} splats are not finite; drop them first", field=name)
     for name, is_bad in (
         ("log_scales", np.isnan(cloud.log_scales).any(axis=1) | (cloud.log_scales > _MAX_LOG_SCALE).any(axis=1)),
