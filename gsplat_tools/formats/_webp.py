@@ -18,8 +18,11 @@ MAX_SIDE = 16383
 Image = NDArray[np.uint8]
 """(height, width, 4) RGBA."""
 
-# Points of method and quality, cheapest first; beyond DEFAULT_EFFORT bytes stop shrinking (docs/formats/sog4d.md).
-_EFFORTS = ((0, 0), (1, 20), (2, 20), (3, 40), (4, 50), (4, 75), (5, 75), (5, 100), (6, 75), (6, 100))
+# Settings (method, quality) that are tried at each effort; the smallest result is kept. Beyond DEFAULT_EFFORT one setting
+# alone does not shrink the images of splats any more (quality 100 takes fifty times as long for the same bytes), so that
+# higher efforts try several.
+_THOROUGH = ((3, 40), (2, 20), (4, 50), (1, 20), (4, 75), (5, 75), (6, 75))
+_EFFORTS = (((0, 0),), ((1, 20),), ((2, 20),), *(_THOROUGH[: count + 1] for count in range(7)))
 DEFAULT_EFFORT = 3
 
 
@@ -52,14 +55,17 @@ def encode_rgba(image: Image, effort: int = DEFAULT_EFFORT) -> bytes:
 
     if not 0 <= effort < len(_EFFORTS):
         raise ValueError(f"effort must be 0 to {len(_EFFORTS) - 1}, got {effort}")
-    method, quality = _EFFORTS[effort]
-    target = io.BytesIO()
-    try:
-        # Without `exact` libwebp changes colors where alpha is 0.
-        fromarray(image, "RGBA").save(target, "WEBP", lossless=True, exact=True, method=method, quality=quality)
-    except KeyError as error:
-        raise MissingDependencyError("this Pillow cannot write WebP; install one that has libwebp") from error
-    return target.getvalue()
+    source = fromarray(image, "RGBA")
+    results = []
+    for method, quality in _EFFORTS[effort]:
+        target = io.BytesIO()
+        try:
+            # Without `exact` libwebp changes colors where alpha is 0.
+            source.save(target, "WEBP", lossless=True, exact=True, method=method, quality=quality)
+        except KeyError as error:
+            raise MissingDependencyError("this Pillow cannot write WebP; install one that has libwebp") from error
+        results.append(target.getvalue())
+    return min(results, key=len)
 
 
 def parse_header(data: bytes, *, field: str, frame: int | None = None) -> WebpHeader:

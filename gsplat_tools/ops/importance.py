@@ -23,7 +23,7 @@ def importance(cloud: GaussianCloud) -> NDArray[np.float32]:
     -------
     NDArray[np.float32]
         (N,) weights in [1 / WEIGHT_RANGE, 1]; the area seen from all sides is taken as the product of the two largest
-        scales. The top 1 % count alike: a backdrop must not own the palette.
+        scales. The top 0.1 % count alike: a backdrop must not own the palette.
 
     Source
     ------
@@ -35,7 +35,7 @@ def importance(cloud: GaussianCloud) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):
         log_opacities = -np.log1p(np.exp(-cloud.opacity_logits.astype(np.float64)))
     log_weights = np.nan_to_num(logs.sum(axis=1) + log_opacities, nan=-np.inf, posinf=np.inf)
-    top = np.quantile(log_weights, 0.99, method="lower") if np.isfinite(log_weights).any() else 0.0
+    top = np.quantile(log_weights, 0.999, method="lower") if np.isfinite(log_weights).any() else 0.0
     if not np.isfinite(top):
         top = log_weights[np.isfinite(log_weights)].max(initial=0.0)
     floor = -np.log(WEIGHT_RANGE)

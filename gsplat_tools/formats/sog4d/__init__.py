@@ -124,9 +124,9 @@ FORMAT = Format(
     read_options=Sog4dReadOptions,
     write_options=Sog4dOptions,
     presets={
-        "fast": {"webp_effort": 1, "palette_rounds": 1},
+        "fast": {"webp_effort": 1, "palette_rounds": 1, "detail": 0.5},
         "balanced": {},
-        "best": {"rotation": "best", "sh0_entries": 256, "palette_rounds": 8, "webp_effort": 9},
+        "best": {"detail": 2.0, "rotation": "best", "sh0_entries": 256, "palette_rounds": 8, "webp_effort": 7},
     },
     model=("unity", "fork-4d"),
 )

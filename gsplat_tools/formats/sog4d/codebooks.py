@@ -23,6 +23,9 @@ SAMPLE_ROWS = 1 << 17
 THIN = 0.02
 """Share of a splat's largest scale that is added to all three before they are compared (`scale_coordinates`)."""
 
+LONG_SHARE = 0.02
+"""Share of splats whose rotation is stored as exactly as four bytes allow, also where the rest is stored small."""
+
 _MIN_LOG = -27.0
 _MAX_LOG = 88.0
 _MAX_HALF = np.float32(65504)
@@ -68,6 +71,7 @@ class Shared:
     sh0_codebook: Float32
     palettes: tuple[Palette, ...] = ()
     rotation_frames: NDArray[np.uint8] | None = None
+    is_long: NDArray[np.bool_] | None = None
     scale_points: Float32 = field(init=False)
 
     def __post_init__(self) -> None:
@@ -153,17 +157,18 @@ def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layo
         sh0_codebook=BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, options.sh0_entries),
         palettes=_fit_palettes(sample, first.sh_degree, len(first), options),
         rotation_frames=frames,
+        is_long=long_splats(first) if options.rotation == "small" else None,
     )
 
 
 def default_scale_size(num_splats: int) -> int:
     """Return how many scale triples a codebook gets by default."""
-    return int(np.clip(num_splats // 20, 512, 16384))
+    return int(np.clip(num_splats // 20, 1024, 16384))
 
 
 def default_palette_size(num_splats: int) -> int:
     """Return how many entries an SH palette gets by default."""
-    return int(np.clip(num_splats // 32, 64, 16384))
+    return int(np.clip(num_splats // 12, 512, 8192))
 
 
 def falling_frames(cloud: GaussianCloud) -> NDArray[np.uint8]:
@@ -179,6 +184,15 @@ def falling_frames(cloud: GaussianCloud) -> NDArray[np.uint8]:
         len(cloud),
     )
     return frames
+
+
+def long_splats(cloud: GaussianCloud) -> NDArray[np.bool_]:
+    """Return which splats are so long and opaque that a small turn shows: a share of LONG_SHARE of all."""
+    lengths = cloud.log_scales.max(axis=1).astype(np.float64) - 0.5 * np.logaddexp(0, -cloud.opacity_logits.astype(np.float64))
+    count = int(np.ceil(LONG_SHARE * len(cloud)))
+    is_long = np.zeros(len(cloud), np.bool_)
+    is_long[np.argsort(-lengths, kind="stable")[:count]] = True
+    return is_long
 
 
 def turned(cloud: GaussianCloud, frames: NDArray[np.uint8] | None) -> tuple[Float32, Float32]:
@@ -197,7 +211,7 @@ def _fit_scales(log_scales: Float32, weights: Float32, num_splats: int, options:
     from gsplat_tools.codecs.palette import fit_palette, nearest_labels
 
     points = scale_coordinates(log_scales)
-    size = options.scale_codebook_size or default_scale_size(num_splats)
+    size = options.scale_codebook_size or int(options.detail * default_scale_size(num_splats))
     centroids = fit_palette(points, weights, size=size, max_rounds=2)
     error = float(nearest_labels(points, centroids)[1].mean(dtype=np.float64))
     codebook = _on_grid(scales_at(centroids), _SCALE_GRID * np.sqrt(error / 3))
@@ -243,7 +257,7 @@ def _fit_palettes(sample: Sample, bands: int, num_splats: int, options: Sog4dOpt
     if options.version == 2:
         starts = np.cumsum([0, *BAND_COEFFICIENTS])
         parts = [(f"sh{i + 1}", int(starts[i]), BAND_COEFFICIENTS[i]) for i in range(bands)]
-    size = options.sh_palette_size or default_palette_size(num_splats)
+    size = options.sh_palette_size or int(options.detail * default_palette_size(num_splats))
     rows = slice(None, None, max(1, len(sample.weights) // max(_MIN_TRAINING, _TRAINING_PER_ENTRY * size)))
     weights = np.sqrt(sample.weights[rows])
     palettes = []

@@ -94,7 +94,7 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: dict[str, Label
         "position_hi": rgba_image((codes >> 8).astype(np.uint8), width, height),
         "position_lo": rgba_image((codes & 0xFF).astype(np.uint8), width, height),
         "scale_indices": index_image(labels["scale"], width, height),
-        "rotation": rgba_image(rotation_bytes(quats, shared.options), width, height),
+        "rotation": rgba_image(rotation_bytes(quats, shared), width, height),
         "sh0": rgba_image(colors, width, height),
     }
     for palette in shared.palettes:
@@ -115,13 +115,17 @@ def position_codes(means: Float32, low: Float32, high: Float32) -> NDArray[np.ui
     return np.rint((means - low.astype(np.float64)) * steps).astype(np.uint16)
 
 
-def rotation_bytes(quats: Float32, options: Sog4dOptions) -> NDArray[np.uint8]:
+def rotation_bytes(quats: Float32, shared: Shared) -> NDArray[np.uint8]:
     """Return the bytes w x y z of quaternions in the frames that were chosen."""
     from gsplat_tools.codecs import quaternion_u8
 
-    if options.rotation == "small":
-        return constant_w_bytes(quats, options.rotation_steps)
-    return quaternion_u8.encode(quats, mode=options.rotation)
+    mode = shared.options.rotation
+    if mode != "small":
+        return quaternion_u8.encode(quats, mode=mode)
+    codes = constant_w_bytes(quats, shared.options.rotation_steps)
+    if shared.is_long is not None:
+        codes[shared.is_long] = quaternion_u8.encode(quats[shared.is_long], mode="best")
+    return codes
 
 
 def constant_w_bytes(quats: Float32, steps: int) -> NDArray[np.uint8]:

@@ -51,6 +51,8 @@ class Sog4dOptions:
         Entries of the codebook of scale triples, at most 65,535; by default chosen from the number of splats.
     sh_palette_size
         Entries of each SH palette, at most 65,535; by default chosen from the number of splats.
+    detail
+        Factor of the default sizes of codebook and palettes, 0.1 to 4.
     centroids
         Numbers in SH palettes: "f16" or "f32".
     sh0_codebook
@@ -87,6 +89,7 @@ class Sog4dOptions:
     delta_segment_length: int = 32
     scale_codebook_size: int | None = None
     sh_palette_size: int | None = None
+    detail: float = 1.0
     centroids: Literal["f16", "f32"] = "f16"
     sh0_codebook: Literal["fit", "base-rgb"] = "fit"
     sh0_entries: int = 128
@@ -119,6 +122,8 @@ class Sog4dOptions:
         _check_range("webp_effort", self.webp_effort, 0, 9)
         _check_range("width", self.width, 1, MAX_SIDE)
         _check_range("height", self.height, 1, MAX_SIDE)
+        if not 0.1 <= self.detail <= 4:
+            raise CapabilityError(f"detail must be 0.1 to 4, got {self.detail}")
         if not 0 <= self.keep_tolerance <= 1:
             raise CapabilityError(f"keep_tolerance must be 0 to 1, got {self.keep_tolerance}")
 
