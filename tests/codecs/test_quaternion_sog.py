@@ -177,4 +177,10 @@ def test_covariances__a_ball_keeps_the_nearest_code() -> None:
 
     turned, _ = in_frames(quats, balls, frames)
     assert angles(turned, quaternion_sog.decode(codes)).max() < np.radians(0.54)
-    np.testing.assert_array_equal(quaternion_sog.encode_covariances(np.zeros((1, 4)), balls[:1])[0], [[128, 128, 128, 252]])
+
+
+def test_covariances__take_length_zero_as_the_identity() -> None:
+    codes, frames = quaternion_sog.encode_covariances(np.zeros((1, 4)), np.array([[-1, -2, -3]]))
+
+    turned, _ = in_frames(np.array([[1, 0, 0, 0]], np.float32), np.zeros((1, 3), np.float32), frames)
+    assert angles(turned, quaternion_sog.decode(codes))[0] < np.radians(0.54)

@@ -116,9 +116,9 @@ FORMAT = Format(
     read_options=SogReadOptions,
     write_options=SogOptions,
     presets={
-        "fast": {"webp_effort": 1, "palette_rounds": 1},
+        "fast": {"rotation": "small", "webp_effort": 1, "palette_rounds": 1},
         "balanced": {},
-        "best": {"rotation": "best", "palette_rounds": 8, "webp_effort": 9},
+        "best": {"palette_rounds": 8, "webp_effort": 9},
     },
     model=("spark", None),
 )
