@@ -15,6 +15,7 @@ from gsplat_tools.attributes.motion import MIN_SIGMA
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.formats.base import Bounds, Format
+from gsplat_tools.formats.splat4d.checking import RULES, check
 from gsplat_tools.formats.splat4d.container import MAGIC
 from gsplat_tools.formats.splat4d.options import Splat4dOptions, Splat4dReadOptions
 from gsplat_tools.formats.splat4d.reading import inspect, read
@@ -83,6 +84,8 @@ FORMAT = Format(
     read=read,
     write=write,
     bounds=bounds,
+    check=check,
+    rules=RULES,
     holds_motion=True,
     fits_sequences=True,
     read_options=Splat4dReadOptions,

@@ -89,6 +89,7 @@ class Contents:
     records: Section
     bands: tuple[Band, ...]
     sections: tuple[Section, ...]
+    has_odd_cutoff: bool = False
 
 
 def parse(stream: BinaryIO) -> Contents:
@@ -132,7 +133,8 @@ def parse(stream: BinaryIO) -> Contents:
     meta_version, cutoff, segment_length, _, *infos = META.unpack(read_exactly(stream, META.size, field="META"))
     if meta_version != 1:
         raise UnsupportedVersionError(f"expected version 1, found {meta_version}", offset=meta.offset, field="metaVersion")
-    if TIME_MODELS[model] == "gaussian" and not 0 < cutoff < 1:
+    has_odd_cutoff = TIME_MODELS[model] == "gaussian" and not 0 < cutoff < 1
+    if has_odd_cutoff:
         message = f"expected a temporalGaussianCutoff between 0 and 1, found {cutoff:g}: {TEMPORAL_CUTOFF:g} is used"
         warnings.warn(GsplatWarning(message, code="temporal-cutoff"), stacklevel=2)
     return Contents(
@@ -140,7 +142,7 @@ def parse(stream: BinaryIO) -> Contents:
         sh_bands=bands,
         time_model=TIME_MODELS[model],
         frame_count=frames,
-        temporal_cutoff=cutoff if TIME_MODELS[model] == "gaussian" and 0 < cutoff < 1 else TEMPORAL_CUTOFF,
+        temporal_cutoff=cutoff if TIME_MODELS[model] == "gaussian" and not has_odd_cutoff else TEMPORAL_CUTOFF,
         delta_segment_length=segment_length,
         records=records,
         bands=tuple(
@@ -148,6 +150,7 @@ def parse(stream: BinaryIO) -> Contents:
             for band in range(1, bands + 1)
         ),
         sections=sections,
+        has_odd_cutoff=has_odd_cutoff,
     )
 
 

@@ -97,7 +97,7 @@ def read(stream: BinaryIO, options: Splat4dReadOptions | None = None) -> Gaussia
         return _read_version_1(stream, options)
     contents = parse(stream)
     cloud = empty_cloud(contents.splat_count, contents.sh_bands, has_motion=True)
-    for start, block in _blocks(stream, contents.records.offset, contents.splat_count):
+    for start, block in record_blocks(stream, contents.records.offset, contents.splat_count):
         record_rows.decode_into(block, cloud.take(slice(start, start + len(block))))
     changed = np.zeros(contents.splat_count, np.bool_)
     for band in contents.bands:
@@ -121,7 +121,7 @@ def _read_version_1(stream: BinaryIO, options: Splat4dReadOptions) -> GaussianCl
     """Read a file that is nothing but records."""
     count = stream_size(stream) // RECORD_BYTES
     cloud = empty_cloud(count, 0, has_motion=True)
-    for start, block in _blocks(stream, 0, count):
+    for start, block in record_blocks(stream, 0, count):
         record_rows.decode_into(block, cloud.take(slice(start, start + len(block))))
     assert cloud.times is not None
     assert cloud.durations is not None
@@ -154,7 +154,7 @@ def _finished(cloud: GaussianCloud, time_model: TimeModel, cutoff: float) -> Gau
     return cloud
 
 
-def _blocks(stream: BinaryIO, offset: int, count: int) -> Iterator[tuple[int, NDArray[Any]]]:
+def record_blocks(stream: BinaryIO, offset: int, count: int) -> Iterator[tuple[int, NDArray[Any]]]:
     """Yield (index of the first, records)."""
     stream.seek(offset)
     for start in range(0, count, _BLOCK_RECORDS):
@@ -252,7 +252,7 @@ def inspect(stream: BinaryIO) -> FileInfo:
         return _inspect_version_1(stream)
     contents = parse(stream)
     box = MotionBox(contents.time_model, contents.temporal_cutoff)
-    for _, block in _blocks(stream, contents.records.offset, contents.splat_count):
+    for _, block in record_blocks(stream, contents.records.offset, contents.splat_count):
         box.add(block["mean"], block["velocity"], _allowed(block["duration"], contents.time_model))
     palettes = {
         f"sh{band.number}": {
@@ -284,11 +284,11 @@ def _inspect_version_1(stream: BinaryIO) -> FileInfo:
     """Return what records alone tell."""
     count = stream_size(stream) // RECORD_BYTES
     times, durations = np.empty(count, np.float32), np.empty(count, np.float32)
-    for start, block in _blocks(stream, 0, count):
+    for start, block in record_blocks(stream, 0, count):
         times[start : start + len(block)], durations[start : start + len(block)] = block["time"], block["duration"]
     time_model: TimeModel = "gaussian" if record_rows.is_gaussian(times, durations) else "window"
     box = MotionBox(time_model)
-    for start, block in _blocks(stream, 0, count):
+    for start, block in record_blocks(stream, 0, count):
         box.add(block["mean"], block["velocity"], _allowed(durations[start : start + len(block)], time_model))
     return FileInfo(
         version="1",
