@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from gsplat_tools import errors
     from gsplat_tools.cloud import GaussianCloud
     from gsplat_tools.comparison import compare
+    from gsplat_tools.errors import GsplatError, GsplatWarning
     from gsplat_tools.formats import FORMATS, load, save
     from gsplat_tools.formats.sequences import open_sequence
     from gsplat_tools.reference.camera import Camera
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "FORMATS": "gsplat_tools.formats",
+    "GsplatError": "gsplat_tools.errors",
+    "GsplatWarning": "gsplat_tools.errors",
     "Camera": "gsplat_tools.reference.camera",
     "GaussianCloud": "gsplat_tools.cloud",
     "GaussianSequence": "gsplat_tools.sequence",
@@ -37,6 +40,8 @@ __all__ = [
     "Camera",
     "GaussianCloud",
     "GaussianSequence",
+    "GsplatError",
+    "GsplatWarning",
     "compare",
     "errors",
     "load",

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.attributes.coordinate_systems import UNKNOWN, is_known
 from gsplat_tools.constants import MAX_SH_DEGREE, TEMPORAL_CUTOFF
 from gsplat_tools.errors import CloudError
 
@@ -106,6 +107,11 @@ class GaussianCloud:
             raise CloudError(f"expected one of {get_args(TimeModel)}, found {self.time_model!r}", field="time_model")
         if not 0 < self.temporal_cutoff < 1:
             raise CloudError(f"expected a number between 0 and 1, found {self.temporal_cutoff!r}", field="temporal_cutoff")
+        if self.coordinate_system != UNKNOWN and not is_known(self.coordinate_system):
+            raise CloudError(
+                f"expected axis letters such as RUB, or {UNKNOWN!r}, found {self.coordinate_system!r}",
+                field="coordinate_system",
+            )
         if self.splat_model not in get_args(SplatModel):
             raise CloudError(f"expected one of {get_args(SplatModel)}, found {self.splat_model!r}", field="splat_model")
         origin = np.array(self.origin, np.float64)

@@ -16,7 +16,7 @@ import numpy as np
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import AttributeTally, compare_rendered, paired, sample
-from gsplat_tools.errors import CapabilityError, GsplatWarning, ValidationError
+from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, ValidationError
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import open_scene
 from gsplat_tools.formats.preparing import Prepared
@@ -146,7 +146,11 @@ def convert(
     def check(stream: BinaryIO, prepared: Prepared, written: Format) -> None:
         assert validation is not None
         start = time.perf_counter()
-        outcome["validation"] = _validate(Path(stream.name), prepared.scene, written, validation)
+        try:
+            outcome["validation"] = _validate(Path(stream.name), prepared.scene, written, validation)
+        except GsplatError as error:
+            error.path = Path(target)  # not the temporary file that was read back
+            raise
         seconds["validate"] = time.perf_counter() - start
 
     with warnings.catch_warnings(record=True) as caught:

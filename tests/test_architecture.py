@@ -1,6 +1,7 @@
 """Rules of the layout that no other tool checks."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -70,4 +71,15 @@ def test_public_functions__document_every_parameter() -> None:
                 for a in arguments
                 if a.arg not in {"self", "cls"} and a.arg[0] != "_" and a.arg not in section
             ]
+    assert missing == []
+
+
+@pytest.mark.parametrize(
+    "page", sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")]), ids=name_of
+)
+def test_document__links_to_what_is_there(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8"))
+
+    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
+
     assert missing == []

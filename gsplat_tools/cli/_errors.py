@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +25,19 @@ EXIT_INTERRUPTED = 130
 def one_line(text: object) -> str:
     """Return a text without line breaks."""
     return " ".join(str(text).split())
+
+
+def _end_cleanly_on_signals() -> None:
+    """Let SIGTERM and SIGHUP unwind the stack, so that temporary files are removed."""
+
+    def end(number: int, _frame: object) -> None:
+        click.echo(f"ended by {signal.Signals(number).name}; the target is as it was", err=True)
+        sys.exit(128 + number)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), end)
 
 
 @contextmanager
@@ -49,6 +64,7 @@ def reports_errors(command: Callable[Parameters, Result]) -> Callable[Parameters
 
     @functools.wraps(command)
     def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        _end_cleanly_on_signals()
         try:
             with _showing_warnings():
                 return command(*args, **kwargs)

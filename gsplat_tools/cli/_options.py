@@ -2,23 +2,69 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from gsplat_tools.attributes.coordinate_systems import is_known
 from gsplat_tools.formats.registry import FORMATS
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 EXISTING_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 MODELS = ("inria", "unity", "spark", "visionary")
-AXES = "axis letters such as RUB, RDF, RUF or LUF"
 
 
-class SizeType(click.ParamType[tuple[int, int]]):
+# click's types take a parameter from 8.4 on only, and older versions serve as well.
+if TYPE_CHECKING:
+    SizeBase = click.ParamType[tuple[int, int]]
+    DegreeBase = click.ParamType[int | str]
+    TimesBase = click.ParamType[list[float]]
+    AxesBase = click.ParamType[str]
+    FloatBase = click.ParamType[float]
+else:
+    SizeBase = DegreeBase = TimesBase = AxesBase = FloatBase = click.ParamType
+
+
+class AxesType(AxesBase):
+    """Three axis letters."""
+
+    name = "AXES"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the letters in capitals."""
+        axes = str(value).upper()
+        if not is_known(axes):
+            self.fail(f"{value!r} is not three axis letters such as RUB, RDF, RUF or LUF", param, ctx)
+        return axes
+
+
+class FiniteType(FloatBase):
+    """A finite number, in a range if one is given."""
+
+    name = "NUMBER"
+
+    def __init__(self, low: float = -math.inf, high: float = math.inf) -> None:
+        self._low = low
+        self._high = high
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or not self._low <= number <= self._high:
+            wanted = "a number" if math.isinf(self._low) else f"a number from {self._low:g} to {self._high:g}"
+            self.fail(f"{value!r} is not {wanted}", param, ctx)
+        return number
+
+
+class SizeType(SizeBase):
     """WxH in pixels."""
 
     name = "WxH"
@@ -33,7 +79,7 @@ class SizeType(click.ParamType[tuple[int, int]]):
         return int(match[1]), int(match[2])
 
 
-class DegreeType(click.ParamType[int | str]):
+class DegreeType(DegreeBase):
     """0 to 4, or auto."""
 
     name = "0..4|auto"
@@ -61,7 +107,7 @@ class FramesType(click.ParamType[int | str]):
         return int(value)
 
 
-class FrameTimesType(click.ParamType[list[float]]):
+class FrameTimesType(TimesBase):
     """A comma-separated list, or a file of one number a line."""
 
     name = "FILE|LIST"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -65,10 +66,21 @@ def _bar(label: str, total: int, unit: str) -> Stage:
                 dynamic_ncols=True,
             )
 
+            # A stage may be silent for long between two steps: the clock keeps the line alive.
+            self._done = threading.Event()
+            self._clock = threading.Thread(target=self._tick, daemon=True)
+            self._clock.start()
+
+        def _tick(self) -> None:
+            while not self._done.wait(max(1.0, interval)):
+                self._bar.refresh()
+
         def advance(self, amount: int) -> None:
             self._bar.update(amount)
 
         def close(self) -> None:
+            self._done.set()
+            self._clock.join()
             self._bar.close()
 
     return Bar()

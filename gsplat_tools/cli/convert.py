@@ -81,10 +81,14 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 @click.option(
     "--sh-degree", type=options.DegreeType(), help="Highest SH band to keep; auto drops bands that are zero everywhere."
 )
-@click.option("--prune-opacity", type=click.FloatRange(0, 1), help="Drop splats of lower opacity; 0 prunes nothing.")
+@click.option("--prune-opacity", type=options.FiniteType(0, 1), help="Drop splats of lower opacity; 0 prunes nothing.")
 @click.option("--order", type=click.Choice(["morton", "hilbert2d", "none"]), help="Order of splats; none keeps the source's.")
-@click.option("--source-coordinates", metavar="AXES", help=f"Axes of the source, {options.AXES}; by default what it says.")
-@click.option("--target-coordinates", metavar="AXES", help="Axes to convert to; by default nothing is converted.")
+@click.option(
+    "--source-coordinates",
+    type=options.AxesType(),
+    help="Axes of the source, such as RUB, RDF, RUF or LUF (right, up, back ...); by default what it says.",
+)
+@click.option("--target-coordinates", type=options.AxesType(), help="Axes to convert to; by default nothing is converted.")
 @click.option(
     "--recenter",
     type=click.Choice(["auto", "on", "off"]),
@@ -93,7 +97,9 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 @click.option("--strict", is_flag=True, help="Refuse invalid splats and losses instead of dropping and counting them.")
 @_format_options
 @click.option("--frame-times", type=options.FrameTimesType(), help="Times of the source frames: a file or a list, in [0, 1].")
-@click.option("--time", "time_at", type=float, help="Take the moment at this normalized time of a sequence or 4D asset.")
+@click.option(
+    "--time", "time_at", type=options.FiniteType(), help="Take the moment at this normalized time of a sequence or 4D asset."
+)
 @click.option("--frame", type=click.IntRange(min=0), help="Take this stored frame of a sequence.")
 @click.option(
     "--interpolation",
@@ -128,7 +134,10 @@ def _takes(record: Format, flag: str, name: str) -> bool:
     "--validate/--no-validate", default=True, help="Read the target back, hold it against its bounds, render and compare."
 )
 @click.option(
-    "--min-psnr", type=float, metavar="DB", help="Fail, and leave the target as it was, if the worst view is below this."
+    "--min-psnr",
+    type=options.FiniteType(),
+    metavar="DB",
+    help="Fail, and leave the target as it was, if the worst view is below this.",
 )
 @click.option("--views", type=click.IntRange(min=0), default=2, show_default=True, help="Views to render when validating.")
 @click.option("--model", type=click.Choice(options.MODELS), help="Rendering model to validate with; by default the target's.")
@@ -154,7 +163,8 @@ def main(
     """Convert SOURCE to TARGET, and prove that the target is right.
 
     SOURCE is a file, or the frames of a sequence: several files, a folder or a quoted glob. The formats follow from
-    content and extension.
+    content and extension. In a folder, targets are named after the source; .gspk and others that share an extension
+    get the id of their format before it.
 
     \b
     gsplat-convert scene.ply scene.gspk
@@ -198,12 +208,14 @@ def _targets(sources: tuple[str, ...], target: Path, formats: tuple[str, ...]) -
     target.mkdir(parents=True, exist_ok=True)
     name = Path(sources[0]).name
     stem = name[: -len(Path(name).suffix)] if Path(name).suffix else name
-    names = [f"{stem}{FORMATS[to].extensions[0]}" for to in formats]
-    # Two layouts share an extension: tell them apart by the format's name.
-    return [
-        (target / (one if names.count(one) == 1 else f"{stem}.{to}{FORMATS[to].extensions[0]}"), to)
-        for one, to in zip(names, formats, strict=True)
-    ]
+    return [(target / f"{stem}{_ending(FORMATS[to])}", to) for to in formats]
+
+
+def _ending(record: Format) -> str:
+    """Return the end of a file's name; formats that share an extension put their id before it."""
+    extension = record.extensions[0]
+    is_shared = sum(extension in other.extensions for other in FORMATS.values()) > 1
+    return f".{record.id}{extension}" if is_shared else extension
 
 
 def _every_frame(
@@ -218,8 +230,8 @@ def _every_frame(
     frames = inspect_file(sources[0])[1].frames if is_bundle else 1
     if frames == 1 or record.holds_sequences:
         return [target], [arguments]
-    stem = path.name[: -len(record.extensions[0])]
-    names = [path.with_name(f"{stem}_{frame:05d}{record.extensions[0]}") for frame in range(frames)]
+    stem = path.name.removesuffix(_ending(record))
+    names = [path.with_name(f"{stem}_{frame:05d}{_ending(record)}") for frame in range(frames)]
     return [(name, to) for name in names], [{**arguments, "frame": frame} for frame in range(frames)]
 
 
@@ -241,7 +253,11 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
     )
     if given["min_psnr"] is not None and (validation is None or given["views"] == 0):
         raise click.UsageError("--min-psnr needs --validate and at least one view")
-    general = {option.name: given[option.name] for option in fields(SaveChoices) if given[option.name] not in (None, False)}
+    general = {
+        option.name: given[option.name]
+        for option in fields(SaveChoices)
+        if given[option.name] is not None and given[option.name] is not False
+    }
     shared = {
         "preset": given["preset"],
         "validation": validation,

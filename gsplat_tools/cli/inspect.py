@@ -21,7 +21,8 @@ class InfoByDefault(click.Group):
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
         """Take `gsplat-inspect FILE` as `gsplat-inspect info FILE`."""
-        if args and args[0] not in self.commands and not args[0].startswith("-") and Path(args[0]).exists():
+        is_command = not args or args[0] in self.commands or args[0].startswith("-")
+        if not is_command and (Path(args[0]).exists() or any(mark in args[0] for mark in "./")):
             args = ["info", *args]
         return super().resolve_command(ctx, args)
 
@@ -61,6 +62,10 @@ def _plain(value: Any) -> str:
             return f"{len(value)} entries (see --json)"
         return ", ".join(f"{name} {_plain(item)}" for name, item in value.items()) or "-"
     if isinstance(value, list | tuple):
+        if not value:
+            return "-"
+        if all(isinstance(item, float) for item in value):
+            return f"({', '.join(map(repr, value))})"
         return f"({', '.join(map(_plain, value))})" if len(value) <= 12 else f"{len(value)} values (see --json)"
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]

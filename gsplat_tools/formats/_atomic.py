@@ -44,8 +44,11 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     WriteError
         The folder is missing, the disk is full, or another refusal by the operating system.
     """
+    path = path.resolve()  # a link stays a link, and what it points to is replaced
     if path.is_dir():
         raise TargetExistsError("the target is a folder; name a file in it", path=path)
+    if path.exists() and not path.is_file():
+        raise WriteError("the target is not a regular file (a device or a pipe); write to a file", path=path)
     if path.exists() and not overwrite:
         raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=path)
     if not path.parent.is_dir():

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.attributes.coordinate_systems import is_known
 from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, GsplatWarning, LossyConversionWarning
@@ -56,6 +57,18 @@ class SaveChoices:
     target_coordinates: str | None = None
     recenter: Literal["auto", "on", "off"] = "auto"
     strict: bool = False
+
+    def __post_init__(self) -> None:
+        choices = {"order": (None, "morton", "hilbert2d", "none"), "recenter": ("auto", "on", "off"), "strict": (True, False)}
+        for name, known in choices.items():
+            if getattr(self, name) not in known:
+                raise CapabilityError(f"{name} must be one of {', '.join(map(str, known))}, got {getattr(self, name)!r}")
+        for name in ("source_coordinates", "target_coordinates"):
+            axes = getattr(self, name)
+            if axes is not None and not is_known(axes):
+                raise CapabilityError(f"{name} must be axis letters such as RUB, RDF, RUF or LUF, got {axes!r}")
+        if not 0 <= self.prune_opacity <= 1:
+            raise CapabilityError(f"prune_opacity must be 0 to 1, got {self.prune_opacity}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,12 +216,12 @@ def _scan(chunks: CloudChunks, choices: SaveChoices) -> _Scan:
             scan.num_splats += len(chunk)
             scan.add(_clean(chunk, choices, scan.dropped))
             progress.advance(len(chunk))
-    if choices.strict and scan.dropped:
+    invalid = {cause: count for cause, count in scan.dropped.items() if cause != "pruned-opacity"}
+    if choices.strict and invalid:
         raise CloudError(
-            f"{sum(scan.dropped.values())} of {scan.num_splats} splats would be dropped: {_counts(scan.dropped)}; "
+            f"{sum(invalid.values())} of {scan.num_splats} splats would be dropped: {_counts(invalid)}; "
             "repair them or leave out --strict"
         )
-    invalid = {cause: count for cause, count in scan.dropped.items() if cause != "pruned-opacity"}
     warn_dropped(invalid, scan.num_splats)
     return scan
 
@@ -273,6 +286,8 @@ class _Fit:
             chunk = without_origin(chunk)
         if self._shift.any():
             chunk = recenter(chunk, chunk.origin + self._shift)
+        if not self._target.stores_origin and chunk.origin.any():
+            chunk = chunk.replace(origin=np.zeros(3))  # given up with a warning: what is written starts from here
         return chunk
 
     def _turn(self, cloud: GaussianCloud) -> GaussianCloud:

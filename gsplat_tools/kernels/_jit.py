@@ -7,7 +7,6 @@ That keeps compilation short (no parallel transform) and results the same for an
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, cast
 
 from numba import njit
@@ -15,15 +14,29 @@ from numba.core import event
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
-# fastmath stays off: the reference must give the same bits on every machine.
-kernel = cast("Callable[[], Decorator]", partial(njit, cache=True, nogil=True, fastmath=False, error_model="numpy"))
-"""Compiles a loop over arrays; the result is cached on disk."""
 
-device = cast(
-    "Callable[[], Decorator]",
-    partial(njit, cache=True, nogil=True, fastmath=False, error_model="numpy", inline="never"),
-)
-"""Compiles a scalar function that kernels call; LLVM decides where it is inlined."""
+def _compiled(**options: Any) -> Decorator:
+    """Return the decorator; where no folder can be written for its cache, it compiles anew in every process."""
+    # fastmath stays off: the reference must give the same bits on every machine.
+    fixed = {"nogil": True, "fastmath": False, "error_model": "numpy", **options}
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return cast("Callable[..., Any]", njit(cache=True, **fixed)(function))
+        except RuntimeError:
+            return cast("Callable[..., Any]", njit(cache=False, **fixed)(function))
+
+    return decorate
+
+
+def kernel() -> Decorator:
+    """Compile a loop over arrays; the result is cached on disk."""
+    return _compiled()
+
+
+def device() -> Decorator:
+    """Compile a scalar function that kernels call; LLVM decides where it is inlined."""
+    return _compiled(inline="never")
 
 
 class _FirstCompilation(event.Listener):

@@ -1,4 +1,8 @@
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -204,3 +208,63 @@ def test_convert__writes_every_frame_of_a_sequence_into_a_folder(tmp_path: Path)
     back = [load(tmp_path / "back" / f"s_{i:05d}.ply") for i in range(3)]
     for cloud, read in zip(clouds, back, strict=True):
         assert np.abs(cloud.opacity_logits - read.opacity_logits).max() < 0.05  # type: ignore[union-attr]
+
+
+def test_convert__takes_zero_for_an_answer(scene: Path, tmp_path: Path) -> None:
+    report = json.loads(run(scene, tmp_path / "a.gspk", "--sh-degree", 0, "--json", "--quiet").stdout)
+
+    assert report["sh_degree"] == 0
+
+
+@pytest.mark.parametrize("target", ["gscc", "sog4d", "splat4d", "spz", "sog", "splat"])
+def test_convert__recenters_for_targets_without_an_origin_and_says_where_it_was(target: str, tmp_path: Path) -> None:
+    far = random_cloud(60, sh_degree=0)
+    save(far.replace(means=far.means + np.float32(500), coordinate_system="RUF"), tmp_path / "far.ply")
+
+    result = run(tmp_path / "far.ply", tmp_path / f"out.{target}", "--recenter", "on", "--json", "--quiet")
+
+    report = json.loads(result.stdout)
+    assert report["validation"]["passed"] is True
+    assert "origin-lost" in {warning["code"] for warning in report["warnings"]}
+    assert report["validation"]["attributes"]["means"]["max"] < 0.01
+
+
+def test_convert__refuses_axes_that_do_not_exist(scene: Path, tmp_path: Path) -> None:
+    result = run(scene, tmp_path / "a.gspk", "--source-coordinates", "QQQ")
+
+    assert result.exit_code == 2
+    assert "is not three axis letters" in result.stderr
+
+
+@pytest.mark.parametrize("arguments", [["--prune-opacity", "nan"], ["--min-psnr", "nan"], ["--prune-opacity", "1.5"]])
+def test_convert__refuses_numbers_that_are_none(scene: Path, tmp_path: Path, arguments: list[str]) -> None:
+    result = run(scene, tmp_path / "a.gspk", *arguments)
+
+    assert result.exit_code == 2
+    assert "is not a number" in result.stderr
+
+
+def test_convert__prunes_under_strict(scene: Path, tmp_path: Path) -> None:
+    assert run(scene, tmp_path / "a.ply", "--strict", "--prune-opacity", 0.5, "--quiet").exit_code == 0
+
+
+def test_convert__makes_no_folder_for_a_source_that_is_not_there(tmp_path: Path) -> None:
+    result = run(tmp_path / "no.ply", tmp_path / "out", "--to", "spark", "--to", "ply")
+
+    assert result.exit_code == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_convert__that_is_ended_removes_its_temporary_file(tmp_path: Path) -> None:
+    save(random_cloud(30_000, sh_degree=3), tmp_path / "scene.ply")
+    (tmp_path / "out").mkdir()
+    command = [str(Path(sys.executable).parent / "gsplat-convert"), "scene.ply", "out/scene.sog4d", "--preset", "best"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not any((tmp_path / "out").iterdir()) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+    process.send_signal(signal.SIGTERM)
+
+    assert process.wait(60) == 128 + signal.SIGTERM
+    assert not any((tmp_path / "out").iterdir())

@@ -125,3 +125,10 @@ def test_compare__goes_through_the_frames_of_sequences(tmp_path: Path) -> None:
     assert [level["frame"] for level in report["frames"]] == [0, 1, 2]
     assert [view["name"] for view in report["views"]][:3] == ["frame 0 view 0", "frame 0 view 1", "frame 1 view 0"]
     assert report["identical"] is True
+
+
+def test_inspect__says_that_a_file_is_not_there(tmp_path: Path) -> None:
+    result = run(tmp_path / "no.ply")
+
+    assert result.exit_code == 2
+    assert "no.ply' does not exist" in result.stderr

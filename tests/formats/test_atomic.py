@@ -75,3 +75,21 @@ def test_replacing__turns_a_full_disk_into_a_located_error(tmp_path: Path) -> No
 
     assert caught.value.path == tmp_path / "a.bin"
     assert not any(tmp_path.iterdir())
+
+
+def test_replacing__follows_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real.bin").write_bytes(b"old")
+    (tmp_path / "link.bin").symlink_to(tmp_path / "real.bin")
+
+    with replacing(tmp_path / "link.bin", overwrite=True) as stream:
+        stream.write(b"new")
+
+    assert (tmp_path / "link.bin").is_symlink()
+    assert (tmp_path / "real.bin").read_bytes() == b"new"
+
+
+def test_replacing__refuses_what_is_no_regular_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+
+    with pytest.raises(GsplatError, match="not a regular file"), replacing(tmp_path / "pipe", overwrite=True):
+        pytest.fail("the block must not run")

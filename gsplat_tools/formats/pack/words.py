@@ -133,7 +133,7 @@ class ClampTally:
         }
         parts = [f"{self.clamped[name]} {text}" for name, text in words.items() if name in self.clamped]
         if parts:
-            message = f"clamped {', '.join(parts)}, in {self.splats} splats; --spark-encoding fit holds them all"
+            message = f"clamped {', '.join(parts)}, in {self.splats} splats; .gspk with --spark-encoding fit holds them all"
             warnings.warn(LossyConversionWarning(message, code="clamped"), stacklevel=3)
         if "flattened" in self.clamped:
             message = f"{self.clamped['flattened']} scale axes below e^{FLAT_LN_SCALE:g} became exactly flat"
