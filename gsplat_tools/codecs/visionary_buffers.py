@@ -1,0 +1,233 @@
+"""Visionary's storage buffers: Gaussians of ten scalars, SH at a fixed stride, raw colors, as 32-bit words.
+
+| buffer | f32 | f16 |
+|---|---|---|
+| Gaussian: x y z opacity, covariance xx xy xz yy yz zz | 10 words, 40 bytes | 5 words, 20 bytes |
+| SH: 48 scalars for any degree | 48 words | 24 words |
+| raw color: r g b | 3 words | 2 words, the fourth half is 0 |
+
+Two halves share a word, the first in the low bits. Opacity is linear. SH "interleaved": coefficient k at scalars 3k to
+3k + 2; "channel-major": the constant term at 0 to 2, then m coefficients of red, of green and of blue, with
+m = (degree + 1)^2 - 1.
+
+Source: preprocess.wgsl and utils/half.ts of Visionary-Laboratory/visionary @ c5d7070; see docs/visionary.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+Precision = Literal["f32", "f16"]
+ShLayout = Literal["interleaved", "channel-major"]
+Words = NDArray[np.uint32]
+
+MAX_SH_DEGREE = 3
+"""Highest SH band that the buffers hold."""
+
+GAUSSIAN_SCALARS = 10
+SH_SCALARS = 48
+
+
+def encode_gaussians(
+    means: NDArray[Any], opacities: NDArray[Any], covariances: NDArray[Any], *, precision: Precision = "f16"
+) -> Words:
+    """Return the Gaussian buffer.
+
+    Parameters
+    ----------
+    means
+        (N, 3) centers.
+    opacities
+        (N,) linear opacities.
+    covariances
+        (N, 6) upper triangles xx, xy, xz, yy, yz, zz.
+    precision
+        "f32" or "f16".
+
+    Returns
+    -------
+    NDArray
+        (N, 10) or (N, 5) uint32, little-endian bytes. Halves are rounded to nearest, ties to even; below 2^-25 they are
+        0, from 65520 infinite.
+
+    Raises
+    ------
+    ValueError
+        The precision is unknown.
+    """
+    scalars = np.concatenate([means, np.asarray(opacities)[:, None], covariances], axis=1)
+    return _to_words(scalars, precision)
+
+
+def decode_gaussians(words: Words, *, precision: Precision = "f16") -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return means (N, 3), opacities (N,) and covariances (N, 6) as float32.
+
+    Parameters
+    ----------
+    words
+        (N, 10) or (N, 5) uint32.
+    precision
+        "f32" or "f16".
+
+    Raises
+    ------
+    ValueError
+        The precision is unknown, or the shape does not fit it.
+    """
+    scalars = _to_scalars(words, precision, GAUSSIAN_SCALARS)
+    return scalars[:, :3], scalars[:, 3], scalars[:, 4:]
+
+
+def encode_sh(sh0: NDArray[Any], shN: NDArray[Any], *, precision: Precision = "f16", layout: ShLayout = "interleaved") -> Words:
+    """Return the SH buffer; what the degree lacks is 0.
+
+    Parameters
+    ----------
+    sh0
+        (N, 3) constant terms.
+    shN
+        (N, K - 1, 3) higher coefficients, basis-major, up to degree 3.
+    precision
+        "f32" or "f16".
+    layout
+        "interleaved", which Visionary reads, or "channel-major", which its shader has but nothing switches on.
+
+    Returns
+    -------
+    NDArray
+        (N, 48) or (N, 24) uint32.
+
+    Raises
+    ------
+    ValueError
+        Precision or layout is unknown, or the degree is above 3.
+    """
+    _check_layout(layout)
+    count, num_rest = shN.shape[:2]
+    if num_rest not in (0, 3, 8, 15):
+        raise ValueError(f"Visionary's buffer holds SH degrees 0 to {MAX_SH_DEGREE}, got {num_rest} higher coefficients")
+    scalars = np.zeros((count, SH_SCALARS), np.float32)
+    scalars[:, :3] = sh0
+    rest = np.moveaxis(shN, 1, 2) if layout == "channel-major" else shN
+    scalars[:, 3 : 3 + 3 * num_rest] = rest.reshape(count, 3 * num_rest)
+    return _to_words(scalars, precision)
+
+
+def decode_sh(
+    words: Words, degree: int, *, precision: Precision = "f16", layout: ShLayout = "interleaved"
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return sh0 (N, 3) and shN (N, K - 1, 3) as the shader reads them.
+
+    Parameters
+    ----------
+    words
+        (N, 48) or (N, 24) uint32.
+    degree
+        The shader's maxShDeg, 0 to 3. A channel-major buffer has to be read with the degree it was written for.
+    precision
+        "f32" or "f16".
+    layout
+        "interleaved" or "channel-major".
+
+    Raises
+    ------
+    ValueError
+        Precision, layout or degree is unknown, or the shape does not fit.
+    """
+    _check_layout(layout)
+    if not 0 <= degree <= MAX_SH_DEGREE:
+        raise ValueError(f"degree must lie in 0..{MAX_SH_DEGREE}, got {degree}")
+    scalars = _to_scalars(words, precision, SH_SCALARS)
+    num_rest = (degree + 1) ** 2 - 1
+    rest = scalars[:, 3 : 3 + 3 * num_rest]
+    shN = np.moveaxis(rest.reshape(-1, 3, num_rest), 1, 2) if layout == "channel-major" else rest.reshape(-1, num_rest, 3)
+    return np.ascontiguousarray(scalars[:, :3]), np.ascontiguousarray(shN)
+
+
+def encode_raw_colors(colors: NDArray[Any], *, precision: Precision = "f16") -> Words:
+    """Return the buffer of raw colors.
+
+    Parameters
+    ----------
+    colors
+        (N, 3) linear RGB, without SH.
+    precision
+        "f32" or "f16".
+
+    Returns
+    -------
+    NDArray
+        (N, 3) or (N, 2) uint32.
+
+    Raises
+    ------
+    ValueError
+        The precision is unknown.
+    """
+    if precision == "f16":
+        colors = np.concatenate([colors, np.zeros((len(colors), 1), np.float32)], axis=1)
+    return _to_words(colors, precision)
+
+
+def decode_raw_colors(words: Words, *, precision: Precision = "f16") -> NDArray[np.float32]:
+    """Return raw colors (N, 3); the fourth half is ignored.
+
+    Parameters
+    ----------
+    words
+        (N, 3) or (N, 2) uint32.
+    precision
+        "f32" or "f16".
+
+    Raises
+    ------
+    ValueError
+        The precision is unknown, or the shape does not fit it.
+    """
+    scalars = _to_scalars(words, precision, 4 if precision == "f16" else 3)
+    return np.ascontiguousarray(scalars[:, :3])
+
+
+def to_halves(values: NDArray[Any]) -> NDArray[np.float16]:
+    """Return values rounded to half precision: nearest, ties to even, overflow to infinity, one pattern of NaN.
+
+    Parameters
+    ----------
+    values
+        Any shape, float32 or float64.
+    """
+    with np.errstate(over="ignore", under="ignore"):
+        halves = values.astype("<f2")
+    is_nan = np.isnan(halves)
+    if is_nan.any():
+        halves[is_nan] = np.array(0x7E00, "<u2").view("<f2")
+    return halves
+
+
+def _to_words(scalars: NDArray[Any], precision: str) -> Words:
+    """Return scalars (N, W) as words."""
+    if precision == "f32":
+        return np.ascontiguousarray(scalars, "<f4").view("<u4")
+    if precision == "f16":
+        return to_halves(np.ascontiguousarray(scalars)).view("<u4")
+    raise ValueError(f"precision must be one of {', '.join(get_args(Precision))}, got {precision!r}")
+
+
+def _to_scalars(words: Words, precision: str, num_scalars: int) -> NDArray[np.float32]:
+    """Return words as scalars (N, W) float32."""
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision must be one of {', '.join(get_args(Precision))}, got {precision!r}")
+    width = num_scalars if precision == "f32" else num_scalars // 2
+    if words.ndim != 2 or words.shape[1] != width or words.dtype != np.uint32:
+        raise ValueError(f"expected (N, {width}) uint32 words for {precision}, got {words.dtype} of shape {words.shape}")
+    words = np.ascontiguousarray(words, "<u4")
+    return words.view("<f4" if precision == "f32" else "<f2").astype(np.float32, copy=False)
+
+
+def _check_layout(layout: str) -> None:
+    """Refuse an unknown layout of SH."""
+    if layout not in get_args(ShLayout):
+        raise ValueError(f"layout must be one of {', '.join(get_args(ShLayout))}, got {layout!r}")
