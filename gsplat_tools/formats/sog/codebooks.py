@@ -29,6 +29,10 @@ TARGET_ERROR = 0.75 / 255
 
 _PROBES = 8192
 
+# An SH palette is fitted on so many rows at least, and so many for each entry.
+_MIN_TRAINING = 1 << 15
+_TRAINING_PER_ENTRY = 4
+
 _THIN = 0.05
 """Weight that an axis keeps beside a much longer one of the same splat, which is all that shows."""
 
@@ -167,8 +171,10 @@ def fit_palette(shn: Float32, weights: Float32, rows: slice | NDArray[np.int64],
     from gsplat_tools.codecs.scalar_codebook import fit_codebook, nearest_entry
 
     points = shn.reshape(len(shn), -1)
-    size = options.sh_palette_size or choose_palette_size(points[rows], weights[rows])
-    centroids = palette.fit_palette(points[rows], weights[rows], size=size, max_rounds=options.palette_rounds)
+    sample, sample_weights = points[rows], weights[rows]
+    size = options.sh_palette_size or choose_palette_size(sample, sample_weights)
+    step = max(1, len(sample) // max(_MIN_TRAINING, _TRAINING_PER_ENTRY * size))
+    centroids = palette.fit_palette(sample[::step], sample_weights[::step], size=size, max_rounds=options.palette_rounds)
     codebook = fit_codebook(centroids.ravel(), size=CODEBOOK_SIZE)
     indices = np.unique(nearest_entry(centroids, codebook).astype(np.uint8), axis=0)
     labels, _ = palette.nearest_labels(points, codebook[indices])
