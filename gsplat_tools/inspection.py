@@ -366,6 +366,8 @@ def _write_animation(pictures: Sequence[NDArray[np.uint8]], path: Path, *, fps: 
 
 def _write_png(picture: NDArray[np.uint8], path: Path, *, overwrite: bool) -> None:
     """Write an 8-bit picture."""
+    if path.suffix.lower() != ".png":
+        raise CapabilityError("pictures are written as PNG; give a name that ends in .png", path=path)
     from PIL import Image
 
     with replacing(path, overwrite=overwrite) as stream:

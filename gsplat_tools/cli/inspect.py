@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -155,7 +154,7 @@ def compare(
     if rows:
         click.echo(output.table(rows, ("error of", "max", "mean", "rms")))
     else:
-        click.echo("attributes: the splats of the two files cannot be matched")
+        click.echo("attributes: not compared, because counts or positions of the splats do not match")
     rows = [
         (
             view["name"],
@@ -229,7 +228,9 @@ def render(file: Path, *, target: Path | None, jobs: int | None, as_json: bool, 
     if as_json:
         output.print_json(report)
     else:
-        click.echo(one_line(json.dumps(report)), err=True)
+        drawn = ", ".join(output.count(view["drawn"]) for view in report["views"])
+        model = report["model"] + (f" {report['variant']}" if report["variant"] else "")
+        click.echo(f"{report['picture']}: {len(report['views'])} views, model {model}, splats drawn {drawn}", err=True)
 
 
 @main.command()

@@ -177,7 +177,8 @@ def _read_raw_header(stream: BinaryIO) -> bytes:
             if b"ply\r\n".startswith(head.rstrip(b" \t")):  # so far, so good
                 if part:
                     continue
-                raise TruncatedDataError(f"the file ends after {len(head)} bytes, inside the PLY header", offset=len(head))
+                where = f"the file ends after {len(head)} bytes, inside the PLY header" if head else "the file is empty"
+                raise TruncatedDataError(f"{where}; get it again from where it came from", offset=len(head))
             raise CorruptDataError(f"expected a first line 'ply', found {head[:16]!r}", offset=0)
         end = rb"\r[ \t]*end_header[ \t]*\r" if start[1] == b"\r" else rb"\n[ \t]*end_header[ \t\r]*\n"
         match = re.search(end, head)
@@ -259,14 +260,15 @@ def element_offsets(header: PlyHeader, stream: BinaryIO) -> dict[str, int]:
             at_least = "at least " if element.has_lists else ""
             raise TruncatedDataError(
                 f"the header promises {element.count} rows of {at_least}{element.min_row_bytes} bytes ({needed} bytes), "
-                f"but {size - offset} bytes remain",
+                f"but {size - offset} bytes remain; copy or download the file again",
                 field=element.name,
                 offset=offset,
             )
         offset = _end_of_lists(header, element, stream, offset, size) if element.has_lists else offset + needed
     if offset < size:
         raise CorruptDataError(
-            f"{size - offset} bytes follow the last element; the header promises a file of {offset} bytes, found {size}",
+            f"{size - offset} bytes follow the last element; the header promises a file of {offset} bytes, found {size}; "
+            "export it again, the header does not describe the data",
             offset=offset,
         )
     return offsets
@@ -313,7 +315,7 @@ def check_text_claim(header: PlyHeader, stream: BinaryIO) -> None:
         if element.count and needed > available:
             raise TruncatedDataError(
                 f"the header promises {element.count} rows of {len(element.properties)} values, at least {needed} bytes, "
-                f"but {available} bytes remain",
+                f"but {available} bytes remain; copy or download the file again",
                 field=element.name,
                 offset=header.size,
             )

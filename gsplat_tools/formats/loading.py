@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning
+from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, UnknownFormatError
 from gsplat_tools.formats._stream import seekable
 from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format
 from gsplat_tools.formats.registry import detect, find_format
@@ -33,6 +33,8 @@ def located(path: Path) -> Iterator[None]:
 
 def open_source(path: Path) -> tuple[BinaryIO, Format]:
     """Open a file and find its format from its first bytes, then from its name; the caller closes it."""
+    if path.exists() and not path.is_file():
+        raise UnknownFormatError("this is not a regular file; give a file, or frames in a folder to gsplat-convert", path=path)
     stream = seekable(path.open("rb"))
     try:
         head = stream.read(SNIFF_BYTES)

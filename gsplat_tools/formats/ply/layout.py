@@ -133,7 +133,7 @@ def _rest_names(vertex: PlyElement, scalars: list[str]) -> list[str]:
     counts = [3 * coefficients for coefficients in REST_COEFFICIENTS]
     if len(numbered) not in counts:
         raise CorruptDataError(
-            f"found {len(numbered)} f_rest properties; SH degree 0 to 4 has {', '.join(map(str, counts))}",
+            f"found {len(numbered)} f_rest properties; SH degree 0 to 4 has {', '.join(map(str, counts))}; export whole bands",
             field="f_rest",
             offset=vertex.line_offset,
         )
