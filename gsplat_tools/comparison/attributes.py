@@ -28,7 +28,7 @@ class AttributeStatistics:
     count, max, sum, sum_squares
         Number of values, largest error, and sums for mean and rms.
     bound
-        Largest bound that the encoding allows, or None where none is known beforehand.
+        Largest finite bound that the encoding allows, or None where none is known beforehand.
     exceeded
         Values that are further off than their own bound.
     """
@@ -49,7 +49,7 @@ class AttributeStatistics:
         self.sum += float(errors.sum())
         self.sum_squares += float(np.square(errors).sum())
         if bound is not None:
-            self.bound = max(self.bound or 0.0, float(bound.max(initial=0.0)))
+            self.bound = max(self.bound or 0.0, float(bound.max(initial=0.0, where=np.isfinite(bound))))
             self.exceeded += int(np.count_nonzero(~(errors <= bound + slack)))
 
     def to_json(self) -> dict[str, float | int | None]:
