@@ -7,6 +7,7 @@ import numpy as np
 
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.kernels._jit import device, kernel
+from gsplat_tools.kernels.exponential import exp_nonpositive
 
 BLOCK = 256
 NUM_BOUNDS = 18
@@ -15,6 +16,11 @@ MAX_LOG_SCALE = 20.0
 SCALES, SH, INVALID = 0, 1, 2
 """Places in the array of counts: clamped scale axes, clamped SH values, values that are not a number."""
 NUM_COUNTS = 3
+
+_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_STEPS = np.float32(1023 * np.sqrt(0.5))
+_STEP = np.float32(np.sqrt(2.0) / 1023)
+"""Of the components of quaternions; 0 lies between two."""
 
 
 @device()
@@ -79,6 +85,75 @@ def encode_blocks(means, log_scales, opacity_logits, sh0, rotations, bounds, wor
             counts[INVALID] += np.isnan(logit)
             alpha = np.uint32(np.floor(255.0 / (1.0 + np.exp(-logit)) + 0.5)) if logit == logit else np.uint32(0)  # noqa: PLR0124
             words[i, 3] = np.uint32((r << np.uint32(24)) | (g << np.uint32(16)) | (b << np.uint32(8)) | alpha)
+
+
+@device()
+def _turn(quats, i, d):
+    """Write the vector part of the turn from a quaternion to what its word decodes to, in local axes."""
+    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    square = w * w + x * x + y * y + z * z
+    factor = _ONE / np.sqrt(square if square > _ZERO else _ONE)
+    w, x, y, z = w * factor, x * factor, y * factor, z * factor
+    largest = max(abs(w), abs(x), abs(y), abs(z))
+    rw = (np.floor(w * _STEPS) + _HALF) * _STEP
+    rx = (np.floor(x * _STEPS) + _HALF) * _STEP
+    ry = (np.floor(y * _STEPS) + _HALF) * _STEP
+    rz = (np.floor(z * _STEPS) + _HALF) * _STEP
+    if abs(w) == largest:
+        rw = np.copysign(np.sqrt(max(_ZERO, _ONE - rx * rx - ry * ry - rz * rz)), w)
+    elif abs(x) == largest:
+        rx = np.copysign(np.sqrt(max(_ZERO, _ONE - rw * rw - ry * ry - rz * rz)), x)
+    elif abs(y) == largest:
+        ry = np.copysign(np.sqrt(max(_ZERO, _ONE - rw * rw - rx * rx - rz * rz)), y)
+    else:
+        rz = np.copysign(np.sqrt(max(_ZERO, _ONE - rw * rw - rx * rx - ry * ry)), z)
+    d[0] = w * rx - x * rw - (y * rz - z * ry)
+    d[1] = w * ry - y * rw - (z * rx - x * rz)
+    d[2] = w * rz - z * rw - (x * ry - y * rx)
+
+
+@kernel()
+def block_errors(quats, log_scales, errors):
+    """Sum over every block of the squared error of the covariance, relative to that of the source, were it stored so.
+
+    With l the squared scales, e the errors of their logs and d the vector part of the turn to the decoded rotation, that of
+    one splat is 4 sum_k l_k^2 e_k^2 + 8 sum_k (l_i - l_j)^2 d_k^2 up to third order, i and j the axes other than k.
+
+    quats       float32 (n, 4)  read, wxyz, any length
+    log_scales  float32 (n, 3)  read
+    errors      float64 (m,)    written
+    """
+    d = np.empty(3, np.float32)
+    lows, steps = np.empty(3, np.float32), np.empty(3, np.float32)
+    e, squares = np.empty(3, np.float32), np.empty(3, np.float32)
+    limit = np.float32(MAX_LOG_SCALE)
+    for block in range(errors.shape[0]):
+        first, last = block * BLOCK, min((block + 1) * BLOCK, quats.shape[0])
+        for a in range(3):
+            low, high = limit, -limit
+            for i in range(first, last):
+                value = min(max(log_scales[i, a], -limit), limit)
+                low, high = min(low, value), max(high, value)
+            lows[a], steps[a] = low, (high - low) / np.float32(1023 if a == 1 else 2047)
+        total = 0.0
+        for i in range(first, last):
+            longest = max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
+            if not longest > -limit:
+                continue
+            for a in range(3):
+                value = min(max(log_scales[i, a], -limit), limit)
+                place = (value - lows[a]) / steps[a] if steps[a] > _ZERO else _ZERO
+                e[a] = (np.floor(place + _HALF) - place) * steps[a]
+                squares[a] = exp_nonpositive(np.float32(_TWO * (value - longest)))
+            _turn(quats, i, d)
+            stretched, turned, norm = _ZERO, _ZERO, _ZERO
+            for a in range(3):
+                b, c = (a + 1) % 3, (a + 2) % 3
+                stretched += squares[a] * squares[a] * e[a] * e[a]
+                turned += (squares[b] - squares[c]) * (squares[b] - squares[c]) * d[a] * d[a]
+                norm += squares[a] * squares[a]
+            total += np.float64((stretched + _TWO * turned) / norm)
+        errors[block] = 4.0 * total
 
 
 @kernel()

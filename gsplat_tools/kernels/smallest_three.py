@@ -45,6 +45,10 @@ _FRAME_OF_LARGEST = np.array(
 _QUATS = FRAME_QUATS[CANDIDATES].astype(np.float32)
 _AXES = FRAME_AXES[CANDIDATES]
 
+_CANDIDATE_OF_ORDER = np.full(27, -1, np.int64)
+for _index, _axes in enumerate(_AXES):
+    _CANDIDATE_OF_ORDER[9 * _axes[0] + 3 * _axes[1] + _axes[2]] = _index
+
 # Adding and subtracting 1.5 x 2^23 rounds a float32 below 2^22 to an integer, ties to even.
 _ROUND = np.float32(12582912.0)
 _ZERO, _ONE = np.float32(0), np.float32(1)
@@ -135,6 +139,37 @@ def choose_frames(quats, log_scales, steps, offset, by_angle, frames):
                 best_frame[j] = frame if is_better else best_frame[j]
         for j in range(count):
             frames[start + j] = np.uint8(best_frame[j])
+
+
+@kernel()
+def sorted_frames(quats, log_scales, frames):
+    """The frame whose first axis is the longest, whose second is the shortest, and whose quaternion has w largest.
+
+    quats       float32 (N, 4)  read, wxyz, any length
+    log_scales  float32 (N, 3)  read
+    frames      uint8 (N,)      written
+    """
+    for i in range(quats.shape[0]):
+        longest, shortest = 0, 2
+        for k in range(1, 3):
+            longest = k if log_scales[i, k] > log_scales[i, longest] else longest
+        for k in range(1, -1, -1):
+            shortest = k if log_scales[i, k] < log_scales[i, shortest] else shortest
+        if longest == shortest:  # a ball, or values that are no numbers
+            longest, shortest = 0, 1
+        c = _CANDIDATE_OF_ORDER[9 * longest + 3 * shortest + (3 - longest - shortest)]
+        a, b, e, f = _QUATS[c, 0], _QUATS[c, 1], _QUATS[c, 2], _QUATS[c, 3]
+        qw, qx, qy, qz = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        sizes = (
+            abs(qw * a - qx * b - qy * e - qz * f),
+            abs(qw * b + qx * a + qy * f - qz * e),
+            abs(qw * e - qx * f + qy * a + qz * b),
+            abs(qw * f + qx * e - qy * b + qz * a),
+        )
+        largest = 0
+        for k in range(1, 4):
+            largest = k if sizes[k] > sizes[largest] else largest
+        frames[i] = _FRAME_OF_LARGEST[c, largest]
 
 
 @kernel()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsplat_tools.chunks import as_chunks
 from gsplat_tools.cloud import GaussianCloud
@@ -28,8 +29,9 @@ class CompressedPlyOptions:
     Parameters
     ----------
     rotation
-        Frame of each rotation: "reference" as the format's own encoder; "best" the smallest decoded error; "small" the
-        frame with the smallest turn.
+        Frame of each splat: "reference" as the format's own encoder; "best" brings the longest axis first and the
+        shortest second in every block where that errs less, because boxes of sorted axes are narrow; "small" the frame
+        with the smallest turn.
     """
 
     rotation: Rotation = "best"
@@ -57,8 +59,7 @@ def write(scene: Scene, stream: BinaryIO, options: CompressedPlyOptions) -> None
     cloud = scene if isinstance(scene, GaussianCloud) else as_chunks(scene).read()
     _check(cloud)
     count = len(cloud)
-    frames = choose_frames(cloud.quats, cloud.log_scales, PACKED_PLY, options.rotation)
-    quats, log_scales = in_frames(cloud.quats, cloud.log_scales, frames)
+    quats, log_scales = in_frames(cloud.quats, cloud.log_scales, _frames(cloud, options.rotation))
     bounds = np.empty((-(-count // BLOCK), len(BOUNDS)), np.float32)
     words = np.empty((count, len(WORDS)), np.uint32)
     codes = np.empty((count, 3 * cloud.shN.shape[1]), np.uint8)
@@ -92,6 +93,31 @@ def write(scene: Scene, stream: BinaryIO, options: CompressedPlyOptions) -> None
     parts = [f"{total[place]} {what}" for what, place in clamped.items() if total[place]]
     if parts:
         warnings.warn(LossyConversionWarning(f"clamped: {', '.join(parts)}", code="clamped"), stacklevel=2)
+
+
+def _frames(cloud: GaussianCloud, rotation: Rotation) -> NDArray[np.uint8]:
+    """Return the frame of every splat, or none where all keep theirs."""
+    from gsplat_tools.kernels import compressed_ply, rotation_frames, smallest_three
+
+    if rotation != "best":
+        return choose_frames(cloud.quats, cloud.log_scales, PACKED_PLY, rotation)
+    frames = np.empty(len(cloud), np.uint8)
+
+    def choose(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        num_blocks = -(-(stop - start) // BLOCK)
+        quats, log_scales = cloud.quats[part], cloud.log_scales[part]
+        smallest_three.sorted_frames(quats, log_scales, frames[part])
+        turned, relabelled = np.empty_like(quats), np.empty_like(log_scales)
+        rotation_frames.apply_frames(quats, log_scales, frames[part], turned, relabelled)
+        errors = np.empty((2, num_blocks))
+        compressed_ply.block_errors(quats, log_scales, errors[0])
+        compressed_ply.block_errors(turned, relabelled, errors[1])
+        keeps = np.repeat(errors[0] <= errors[1], BLOCK)[: stop - start]
+        frames[part][keeps] = 0
+
+    run_blocks(choose, len(cloud))
+    return frames
 
 
 def _check(cloud: GaussianCloud) -> None:
