@@ -30,9 +30,6 @@ _MIN_LOG = -27.0
 _MAX_LOG = 88.0
 _MAX_HALF = np.float32(65504)
 
-# Palettes are fitted on so many rows at least, and so many for each entry.
-_MIN_TRAINING = 1 << 15
-_TRAINING_PER_ENTRY = 12
 _PROBES = 8192
 
 # Rounding of stored entries relative to the error that the codebook leaves anyway: it adds about 2 percent to the mean
@@ -258,11 +255,10 @@ def _fit_palettes(sample: Sample, bands: int, num_splats: int, options: Sog4dOpt
         starts = np.cumsum([0, *BAND_COEFFICIENTS])
         parts = [(f"sh{i + 1}", int(starts[i]), BAND_COEFFICIENTS[i]) for i in range(bands)]
     size = options.sh_palette_size or int(options.detail * default_palette_size(num_splats))
-    rows = slice(None, None, max(1, len(sample.weights) // max(_MIN_TRAINING, _TRAINING_PER_ENTRY * size)))
-    weights = np.sqrt(sample.weights[rows])
+    weights = np.sqrt(sample.weights)
     palettes = []
     for name, first, coefficients in parts:
-        points = sample.shN[rows, first : first + coefficients].reshape(-1, 3 * coefficients)
+        points = sample.shN[:, first : first + coefficients].reshape(-1, 3 * coefficients)
         centroids = fit_palette(points, weights, size=size, max_rounds=options.palette_rounds)
         probe = points[:: max(1, len(points) // _PROBES)]
         step = _grid_step(float(nearest_labels(probe, centroids)[1].mean(dtype=np.float64)) / points.shape[1])
