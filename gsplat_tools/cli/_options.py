@@ -93,6 +93,20 @@ class DegreeType(DegreeBase):
         return int(value)
 
 
+class FractionalBitsType(click.ParamType[int | str]):
+    """0 to 23, auto or finest."""
+
+    name = "0..23|auto|finest"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        """Return the number of bits, or the word."""
+        if value in {"auto", "finest"}:
+            return str(value)
+        if not (str(value).isdecimal() and int(value) <= 23):
+            self.fail(f"{value!r} is not 0 to 23, auto or finest", param, ctx)
+        return int(value)
+
+
 class FramesType(click.ParamType[int | str]):
     """A number of frames, or auto."""
 

@@ -40,6 +40,12 @@ FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("--sh0-codebook", "sh0_codebook", {"type": click.Choice(["base-rgb", "fit"]), "help": "Fixed or fitted base colors."}),
     ("--webp-effort", "webp_effort", {"type": click.IntRange(0, 9), "help": "Effort of the lossless WebP images."}),
     ("--zip", "zip", {"type": click.Choice(["auto", "stored", "deflated"]), "help": "auto: images stored, the rest deflated."}),
+    ("--sh1-bits", "sh1_bits", {"type": click.IntRange(1, 8), "help": "Bits of SH values of band 1."}),
+    ("--sh-rest-bits", "sh_rest_bits", {"type": click.IntRange(1, 8), "help": "Bits of SH values above band 1."}),
+    ("--fractional-bits", "fractional_bits", {
+        "type": options.FractionalBitsType(), "help": "Bits of positions behind the point; auto looks at the scene.",
+    }),
+    ("--level", "level", {"type": click.IntRange(1, 22), "help": "Level of zstd or zlib."}),
     ("--seed", "seed", {"type": int, "help": "Seed of everything random."}),
 )  # fmt: skip
 
