@@ -143,7 +143,7 @@ def decode_sh(
     scalars = _to_scalars(words, precision, SH_SCALARS)
     num_rest = (degree + 1) ** 2 - 1
     rest = scalars[:, 3 : 3 + 3 * num_rest]
-    shN = np.moveaxis(rest.reshape(-1, 3, num_rest), 1, 2) if layout == "channel-major" else rest.reshape(-1, num_rest, 3)
+    shN = np.moveaxis(rest.reshape(len(words), 3, num_rest), 1, 2) if layout == "channel-major" else rest.reshape(len(words), num_rest, 3)
     return np.ascontiguousarray(scalars[:, :3]), np.ascontiguousarray(shN)
 
 

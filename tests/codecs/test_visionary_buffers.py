@@ -1,0 +1,120 @@
+"""Visionary's buffers: byte layouts by hand, halves to the bit, and round trips."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsplat_tools.codecs import visionary_buffers as buffers
+
+SCALARS = [1.0, -2.0, 0.5, 0.25, 0.125, 3.0, -4.0, 6.0, 8.0, -0.75]
+
+
+def gaussian() -> tuple[Any, Any, Any]:
+    values = np.array(SCALARS, np.float32)
+    return values[None, :3], values[3:4], values[None, 4:]
+
+
+def harmonics(degree: int, count: int = 2) -> tuple[Any, Any]:
+    numbers = np.arange(count * 3 * (degree + 1) ** 2, dtype=np.float32).reshape(count, -1, 3)
+    return numbers[:, 0], numbers[:, 1:]
+
+
+@pytest.mark.parametrize(("precision", "code", "size"), [("f32", "<10f", 40), ("f16", "<10e", 20)])
+def test_encode_gaussians__packs_ten_scalars_in_order(precision: Any, code: str, size: int) -> None:
+    words = buffers.encode_gaussians(*gaussian(), precision=precision)
+
+    assert words.tobytes() == struct.pack(code, *SCALARS)
+    assert words.nbytes == size
+    for decoded, values in zip(buffers.decode_gaussians(words, precision=precision), gaussian(), strict=True):
+        assert np.array_equal(decoded, values)
+
+
+@pytest.mark.parametrize(
+    ("value", "bits"),
+    [
+        (0.1, 0x2E66),
+        (1 + 2**-11, 0x3C00),  # a tie goes to the even neighbour
+        (1 + 3 * 2**-11, 0x3C02),
+        (2**-24, 0x0001),
+        (2**-25, 0x0000),
+        (65519.0, 0x7BFF),
+        (65520.0, 0x7C00),
+        (-np.inf, 0xFC00),
+        (np.nan, 0x7E00),
+        (-0.0, 0x8000),
+    ],
+)
+def test_to_halves__rounds_as_visionary_does(value: float, bits: int) -> None:
+    assert buffers.to_halves(np.array([value], np.float32)).view(np.uint16)[0] == bits
+
+
+def test_encode_sh__interleaves_colors_of_each_coefficient() -> None:
+    sh0, shN = harmonics(1, 1)
+
+    words = buffers.encode_sh(sh0, shN, precision="f32")
+
+    assert words.shape == (1, 48)
+    assert words.view(np.float32)[0].tolist() == [*range(12), *[0] * 36]
+
+
+def test_encode_sh__keeps_channels_apart_after_the_constant_term() -> None:
+    sh0, shN = harmonics(1, 1)
+
+    words = buffers.encode_sh(sh0, shN, precision="f16", layout="channel-major")
+
+    assert words.shape == (1, 24)
+    assert words.view(np.float16)[0, :12].tolist() == [0, 1, 2, 3, 6, 9, 4, 7, 10, 5, 8, 11]
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("layout", ["interleaved", "channel-major"])
+@pytest.mark.parametrize("precision", ["f32", "f16"])
+def test_decode_sh__gives_back_what_was_encoded(degree: int, layout: Any, precision: Any) -> None:
+    sh0, shN = harmonics(degree)
+
+    words = buffers.encode_sh(sh0, shN, precision=precision, layout=layout)
+    found = buffers.decode_sh(words, degree, precision=precision, layout=layout)
+
+    assert np.array_equal(found[0], sh0)
+    assert np.array_equal(found[1], shN)
+
+
+def test_decode_sh__of_interleaved_may_take_fewer_bands_but_channel_major_shifts() -> None:
+    sh0, shN = harmonics(3)
+
+    usual = buffers.decode_sh(buffers.encode_sh(sh0, shN), 1)[1]
+    shifted = buffers.decode_sh(buffers.encode_sh(sh0, shN, layout="channel-major"), 1, layout="channel-major")[1]
+
+    assert np.array_equal(usual, shN[:, :3])
+    # With m = 3 green begins where red's fourth coefficient lies.
+    assert np.array_equal(shifted[:, :, 0], shN[:, :3, 0])
+    assert np.array_equal(shifted[:, :, 1], shN[:, 3:6, 0])
+
+
+@pytest.mark.parametrize(("precision", "width"), [("f32", 3), ("f16", 2)])
+def test_raw_colors__take_three_words_or_two(precision: Any, width: int) -> None:
+    colors = np.array([[0.5, 0.25, 2.0], [0.0, 1.0, -1.0]], np.float32)
+
+    words = buffers.encode_raw_colors(colors, precision=precision)
+
+    assert words.shape == (2, width)
+    assert precision == "f32" or (words.view(np.float16)[:, 3] == 0).all()
+    assert np.array_equal(buffers.decode_raw_colors(words, precision=precision), colors)
+
+
+def test_buffers__refuse_what_they_do_not_hold() -> None:
+    sh0, shN = harmonics(4)
+    with pytest.raises(ValueError, match="degrees 0 to 3"):
+        buffers.encode_sh(sh0, shN)
+    with pytest.raises(ValueError, match="layout"):
+        buffers.encode_sh(sh0, shN[:, :3], layout="planar")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="precision"):
+        buffers.encode_raw_colors(sh0, precision="i8")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"\(N, 5\) uint32"):
+        buffers.decode_gaussians(np.zeros((2, 10), np.uint32))
+    with pytest.raises(ValueError, match="degree"):
+        buffers.decode_sh(np.zeros((2, 24), np.uint32), 4)
