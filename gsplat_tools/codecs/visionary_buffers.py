@@ -15,6 +15,7 @@ Source: preprocess.wgsl and utils/half.ts of Visionary-Laboratory/visionary @ c5
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -29,6 +30,55 @@ MAX_SH_DEGREE = 3
 
 GAUSSIAN_SCALARS = 10
 SH_SCALARS = 48
+
+_HALF_OVERFLOW = 65520.0
+# Eigenvalues of float64 are this far off, relative to the largest: below, an axis counts as flat.
+_EIGENVALUE_NOISE = 1e-14
+_FULL = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+
+
+@dataclass(frozen=True, slots=True)
+class CovarianceLosses:
+    """What half precision does to covariances, as counts of splats.
+
+    Parameters
+    ----------
+    splats
+        All of them.
+    vanished
+        The smallest axis is no longer there: the smallest eigenvalue is 0 or negative, but was above 0.
+    halved
+        The smallest axis is half as long as before or less, or twice as long or more; this includes the vanished.
+    overflowed
+        A variance is infinite.
+    """
+
+    splats: int
+    vanished: int
+    halved: int
+    overflowed: int
+
+
+def half_covariance_losses(covariances: NDArray[Any]) -> CovarianceLosses:
+    """Count what rounding covariances to half precision loses; needles and small splats suffer most.
+
+    Parameters
+    ----------
+    covariances
+        (N, 6) upper triangles xx, xy, xz, yy, yz, zz, finite; in float64, so that the true smallest axis is known.
+    """
+    halves = to_halves(covariances).astype(np.float64)
+    is_finite = np.isfinite(halves).all(axis=1)
+    eigenvalues = np.linalg.eigvalsh(covariances[is_finite].astype(np.float64)[:, _FULL])
+    least, largest = eigenvalues[:, 0], eigenvalues[:, 2]
+    rounded = np.linalg.eigvalsh(halves[is_finite][:, _FULL])[:, 0]
+    is_there = least > _EIGENVALUE_NOISE * largest
+    return CovarianceLosses(
+        splats=len(covariances),
+        vanished=int(np.count_nonzero((rounded <= 0) & is_there)),
+        halved=int(np.count_nonzero(is_there & ((rounded <= least / 4) | (rounded >= least * 4)))),
+        overflowed=int(np.count_nonzero(~is_finite)),
+    )
 
 
 def encode_gaussians(
@@ -143,7 +193,11 @@ def decode_sh(
     scalars = _to_scalars(words, precision, SH_SCALARS)
     num_rest = (degree + 1) ** 2 - 1
     rest = scalars[:, 3 : 3 + 3 * num_rest]
-    shN = np.moveaxis(rest.reshape(len(words), 3, num_rest), 1, 2) if layout == "channel-major" else rest.reshape(len(words), num_rest, 3)
+    shN = (
+        np.moveaxis(rest.reshape(len(words), 3, num_rest), 1, 2)
+        if layout == "channel-major"
+        else rest.reshape(len(words), num_rest, 3)
+    )
     return np.ascontiguousarray(scalars[:, :3]), np.ascontiguousarray(shN)
 
 
@@ -189,6 +243,45 @@ def decode_raw_colors(words: Words, *, precision: Precision = "f16") -> NDArray[
     """
     scalars = _to_scalars(words, precision, 4 if precision == "f16" else 3)
     return np.ascontiguousarray(scalars[:, :3])
+
+
+def convert_precision(words: Words, *, source: Precision, target: Precision) -> Words:
+    """Return a buffer in another precision, as Visionary's convert_precision pass does from f32 to f16.
+
+    Parameters
+    ----------
+    words
+        (N, D) uint32 for f32, (N, W) for f16.
+    source, target
+        "f32" or "f16". From f32 to f16 an odd number of scalars gets a last half of 0; back, it stays.
+
+    Returns
+    -------
+    NDArray
+        (N, D), (N, ceil(D / 2)) or (N, 2 W) uint32; `half_error` bounds what is lost.
+
+    Raises
+    ------
+    ValueError
+        A precision is unknown, or the words are not a two-dimensional uint32 array.
+    """
+    width = words.shape[1] * (2 if source == "f16" else 1) if words.ndim == 2 else 0
+    scalars = _to_scalars(words, source, width)
+    if target == "f16" and width % 2:
+        scalars = np.concatenate([scalars, np.zeros((len(scalars), 1), np.float32)], axis=1)
+    return _to_words(scalars, target)
+
+
+def half_error(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the largest error of each value in half precision: 2^-11 of it, 2^-25 at least, infinity where it overflows.
+
+    Parameters
+    ----------
+    values
+        Any shape, finite.
+    """
+    sizes = np.abs(values.astype(np.float64))
+    return np.where(sizes >= _HALF_OVERFLOW, np.inf, np.maximum(sizes * 2.0**-11, 2.0**-25))
 
 
 def to_halves(values: NDArray[Any]) -> NDArray[np.float16]:

@@ -118,3 +118,49 @@ def test_buffers__refuse_what_they_do_not_hold() -> None:
         buffers.decode_gaussians(np.zeros((2, 10), np.uint32))
     with pytest.raises(ValueError, match="degree"):
         buffers.decode_sh(np.zeros((2, 24), np.uint32), 4)
+
+
+def test_half_covariance_losses__counts_what_becomes_of_the_smallest_axis() -> None:
+    # Diagonal, so that every variance is rounded alone: 2^-26 vanishes, 0.75 * 2^-24 rises to 2^-24 (not by a factor of 4).
+    diagonals = [(1.0, 1.0, 1.0), (1.0, 1.0, 2.0**-26), (1.0, 1.0, 0.75 * 2**-24), (1e5, 1.0, 1.0), (1.0, 1.0, 0.0)]
+    covariances = np.zeros((5, 6))
+    covariances[:, [0, 3, 5]] = diagonals
+
+    assert buffers.half_covariance_losses(covariances) == buffers.CovarianceLosses(5, vanished=1, halved=1, overflowed=1)
+
+
+def test_half_covariance_losses__of_a_turned_needle_is_total() -> None:
+    # Variances 1 and 1e-5 along the diagonals of a plane: entries near 0.5 are rounded in steps of 2^-11.
+    needle = np.array([[0.500005, 0.499995, 0.0, 0.500005, 0.0, 1.0]])
+
+    losses = buffers.half_covariance_losses(needle)
+
+    assert (losses.vanished, losses.halved) == (1, 1)
+
+
+def test_convert_precision__packs_pairs_and_pads_odd_tails() -> None:
+    scalars = np.array([[1.0, 2.0, -3.0]], np.float32)
+
+    halves = buffers.convert_precision(scalars.view(np.uint32), source="f32", target="f16")
+    back = buffers.convert_precision(halves, source="f16", target="f32")
+
+    assert halves.tobytes() == struct.pack("<4e", 1.0, 2.0, -3.0, 0.0)
+    assert back.view(np.float32).tolist() == [[1.0, 2.0, -3.0, 0.0]]
+    with pytest.raises(ValueError, match="precision"):
+        buffers.convert_precision(halves, source="f16", target="i8")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="uint32"):
+        buffers.convert_precision(halves[0], source="f16", target="f32")
+
+
+def test_half_error__bounds_the_conversion_and_is_reached(rng: np.random.Generator) -> None:
+    values = np.concatenate([rng.normal(size=5000), np.exp(rng.uniform(-25, 11, 5000)), [1 + 2**-11, 2**-25, 65519.99]])
+    values = values.astype(np.float32)[:, None]
+
+    halves = buffers.convert_precision(values.view(np.uint32), source="f32", target="f16")
+    errors = np.abs(
+        buffers.convert_precision(halves, source="f16", target="f32").view(np.float32)[:, :1] - values.astype(float)
+    )
+    shares = errors / buffers.half_error(values)
+
+    assert 0.99 < shares.max() <= 1
+    assert buffers.half_error(np.array([65520.0, -1e6])).tolist() == [np.inf, np.inf]

@@ -296,6 +296,13 @@ def test_normals__of_flat_splats_are_their_flat_axis() -> None:
     assert colors == pytest.approx(np.array([[0.5, 0.5, 1], [0.5, 1, 0.5], [1, 0.5, 0.5]]), abs=2e-3)
 
 
+def test_normals__of_splats_without_thickness_are_their_flat_axis() -> None:
+    found = preprocess(hand.splats([0, 0, 2.0], scales=[[0.0, 0.1, 0.2]]), hand.camera(), render_mode="normal")
+
+    # The determinant is 0: 1e-12 stands for it.
+    assert [*found.records["color_0"][0], found.records["color_1"][0, 0]] == [1.0, 0.5, 0.5]
+
+
 def test_normals__of_points_are_the_default() -> None:
     found = preprocess(hand.splats([0, 0, 2.0], scales=0.0), hand.camera(), render_mode="normal")
 
