@@ -44,6 +44,10 @@ from gsplat_tools.sequence import GaussianSequence
 __all__ = ["FORMAT", "SpzOptions", "inspect", "matches", "read", "read_chunks", "write"]
 
 
+DEFAULT_ZSTD_LEVEL, DEFAULT_ZLIB_LEVEL = 12, 6
+"""Those of the format's own writer."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpzOptions:
     """Choices of the writer.
@@ -61,7 +65,7 @@ class SpzOptions:
         Bits of a position behind the point; "auto" is 12, more for small scenes and fewer for large ones; "finest" is
         as many as fit.
     level
-        Of zstd (version 4), 1 to 22; of zlib (2 and 3) at most 9.
+        Of zstd (version 4), 1 to 22, by default 12; of zlib (2 and 3), 1 to 9, more is taken for 9, by default 6.
     """
 
     version: int = 4
@@ -69,7 +73,7 @@ class SpzOptions:
     sh1_bits: int = 5
     sh_rest_bits: int = 4
     fractional_bits: attributes.FractionalBits = "auto"
-    level: int = 12
+    level: int | None = None
 
 
 def matches(head: bytes) -> bool:
@@ -218,9 +222,9 @@ def write(scene: Scene, stream: BinaryIO, options: SpzOptions) -> None:
     tally = attributes.ClampTally()
     rows = attributes.encode_chunks(chunks, how, tally)
     if options.version >= FIRST_ZSTD_VERSION:
-        streams.write(stream, header, extensions, rows, options.level)
+        streams.write(stream, header, extensions, rows, options.level or DEFAULT_ZSTD_LEVEL)
     else:
-        legacy.write(stream, header, extensions, rows, min(options.level, 9))
+        legacy.write(stream, header, extensions, rows, min(options.level or DEFAULT_ZLIB_LEVEL, 9))
     tally.finish()
 
 
@@ -234,7 +238,7 @@ def _check_options(options: SpzOptions) -> None:
     bits = options.fractional_bits
     if not (bits in ("auto", "finest") or (isinstance(bits, int) and 0 <= bits <= attributes.FINEST_FRACTIONAL_BITS)):
         raise ValueError(f"fractional_bits must be 'auto', 'finest' or 0 to {attributes.FINEST_FRACTIONAL_BITS}, got {bits!r}")
-    if not 1 <= options.level <= 22:
+    if options.level is not None and not 1 <= options.level <= 22:
         raise ValueError(f"level must be 1 to 22, got {options.level}")
 
 

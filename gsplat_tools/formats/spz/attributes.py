@@ -164,13 +164,13 @@ class ClampTally:
             warnings.warn(LossyConversionWarning(f"clamped: {parts}", code="clamped"), stacklevel=3)
 
 
-def encode_rows(cloud: GaussianCloud, how: Quantization, tally: ClampTally) -> Payload:
-    """Return the bytes of a chunk by attribute, and count what was clamped.
+def encode_rows(cloud: GaussianCloud, how: Quantization) -> tuple[Payload, NDArray[np.int64]]:
+    """Return the bytes of a chunk by attribute, and what the kernels counted.
 
     Raises
     ------
     CloudError
-        A value is not a number.
+        A quaternion is not finite.
     """
     from gsplat_tools.kernels import smallest_three, spz_pack
 
@@ -207,10 +207,9 @@ def encode_rows(cloud: GaussianCloud, how: Quantization, tally: ClampTally) -> P
             spz_pack.encode_sh(cloud.shN[part], *buckets, rows["sh"][part], counts[start // BLOCK_SIZE])
 
     run_blocks(encode_block, count)
-    tally.add(counts.sum(axis=0))
     if is_small:
         rows["rotations"] = words.astype("<u4", copy=False).view(np.uint8).reshape(count, 4)
-    return rows
+    return rows, counts.sum(axis=0)
 
 
 def _widths(how: Quantization, cloud: GaussianCloud) -> dict[str, int]:
@@ -282,7 +281,8 @@ def encode_chunks(chunks: CloudChunks, how: Quantization, tally: ClampTally) -> 
         A value is not a number, or the chunks do not hold the splats that were announced.
     """
     total = 0
-    for rows in map_ordered(lambda chunk: encode_rows(chunk, how, tally), chunks, ahead=2):
+    for rows, counts in map_ordered(lambda chunk: encode_rows(chunk, how), chunks, ahead=2):
+        tally.add(counts)
         total += len(rows["positions"])
         yield rows
     if total != len(chunks):
