@@ -8,6 +8,7 @@ The table of fields and rules is docs/formats/sog4d.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CloudError
+from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats._webp import Image
 from gsplat_tools.formats._zip import ZipReader
 from gsplat_tools.formats.base import Bounds, FileInfo, Format
@@ -106,6 +108,18 @@ def _bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
     return bounds(source, stream, frame)
 
 
+def _check(stream: BinaryIO) -> Iterator[Issue]:
+    from gsplat_tools.formats.sog4d.validate import check
+
+    return check(stream)
+
+
+def _repair(source: BinaryIO, target: BinaryIO) -> list[str]:
+    from gsplat_tools.formats.sog4d.repair import repair
+
+    return repair(source, target)
+
+
 FORMAT = Format(
     id="sog4d",
     title=".sog4d sequence bundle",
@@ -118,6 +132,9 @@ FORMAT = Format(
     read=read,
     write=write,
     bounds=_bounds,
+    check=_check,
+    rules=RULES,
+    repair=_repair,
     holds_sequences=True,
     order="morton",
     position_type="fixed",
