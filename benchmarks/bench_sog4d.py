@@ -27,6 +27,7 @@ from gsplat_tools.codecs import quaternion_u8
 from gsplat_tools.codecs.palette import fit_palette, nearest_labels
 from gsplat_tools.formats import _webp
 from gsplat_tools.formats.sog4d import Sog4dOptions, Sog4dReadOptions, read, write
+from gsplat_tools.formats.sog4d.codebooks import SAMPLE_ROWS
 from gsplat_tools.ops.importance import importance
 from gsplat_tools.ops.ordering import image_layout, splat_order
 from gsplat_tools.reference.auto_cameras import auto_cameras
@@ -145,7 +146,7 @@ def measure_palette(name: str, cloud: GaussianCloud, size: int, repeat: int) -> 
         return
     points = np.ascontiguousarray(cloud.shN.reshape(len(cloud), -1))
     weights = importance(cloud)
-    rows = slice(None, None, max(1, len(points) // 65536))
+    rows = np.sort(np.random.default_rng(0).permutation(len(points))[:SAMPLE_ROWS])
     seconds, centroids = best_of(repeat, lambda: fit_palette(points[rows], np.sqrt(weights[rows]), size=size))
     assigning, (_, distances) = best_of(repeat, lambda: nearest_labels(points, centroids))
     work = 2e-9 * len(points) * size * (points.shape[1] + 1)
