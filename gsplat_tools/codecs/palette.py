@@ -21,6 +21,9 @@ _TILE_ELEMENTS = 1 << 22
 _TOLERANCE = 2e-3
 """Rounds end when one lowers the error by less than this share."""
 
+_LEAF_SIZE = 8
+"""Entries that are compared one by one at the bottom of a tree."""
+
 _MIN_FIRST_POINTS = 1 << 15
 _FIRST_POINTS_PER_ENTRY = 8
 _MOMENT_ROWS = 4096
@@ -85,14 +88,11 @@ def _controller() -> ThreadpoolController:
 
 def _nearest_of_three(points: Float32, centroids: Float32) -> tuple[Labels, Float32]:
     """Return labels and squared distances by an exact search."""
-    from gsplat_tools.kernels.nearest import LEAF_SIZE, build_tree, nearest_in_tree
+    from gsplat_tools.kernels.nearest import nearest_in_tree
 
     centroids = np.ascontiguousarray(centroids, np.float32)
     points = np.ascontiguousarray(points, np.float32)
-    depth = max(0, int(np.ceil(np.log2(len(centroids) / LEAF_SIZE)))) + 1
-    order = np.empty(len(centroids), np.int64)
-    axes, cuts = np.empty((1 << (depth + 1)) - 1, np.int64), np.empty((1 << (depth + 1)) - 1, np.float32)
-    build_tree(centroids, order, axes, cuts)
+    order, axes, cuts = _build_tree(centroids)
     leaves = centroids[order]
     labels = np.empty(len(points), np.int64)
     distances = np.empty(len(points), np.float32)
@@ -100,6 +100,38 @@ def _nearest_of_three(points: Float32, centroids: Float32) -> tuple[Labels, Floa
         lambda start, stop: nearest_in_tree(points, leaves, order, axes, cuts, start, stop, labels, distances), len(points)
     )
     return labels, distances
+
+
+def _build_tree(centroids: Float32) -> tuple[Labels, NDArray[np.int64], Float32]:
+    """Return a balanced tree: the order of the leaves, and the axis (-1 for a leaf) and the cut of every node.
+
+    Each node halves its range along its widest axis; a level at a time, all its nodes at once.
+    """
+    size = len(centroids)
+    order = np.arange(size)
+    depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE)))) + 1
+    axes, cuts = np.full((1 << (depth + 1)) - 1, -1, np.int64), np.zeros((1 << (depth + 1)) - 1, np.float32)
+    nodes, starts, stops = np.zeros(1, np.int64), np.zeros(1, np.int64), np.full(1, size)
+    while True:
+        is_wide = stops - starts > _LEAF_SIZE
+        nodes, starts, stops = nodes[is_wide], starts[is_wide], stops[is_wide]
+        if len(nodes) == 0:
+            return order, axes, cuts
+        lengths = stops - starts
+        owners = np.repeat(np.arange(len(nodes)), lengths)
+        firsts = np.cumsum(lengths) - lengths
+        places = np.arange(len(owners)) - firsts[owners] + starts[owners]
+        rows = centroids[order[places]]
+        spans = np.maximum.reduceat(rows, firsts) - np.minimum.reduceat(rows, firsts)
+        widest = spans.argmax(axis=1)
+        values = rows[np.arange(len(rows)), widest[owners]]
+        ranks = np.lexsort((values, owners))
+        order[places] = order[places[ranks]]
+        middles = (starts + stops) // 2
+        axes[nodes] = widest
+        cuts[nodes] = centroids[order[middles - 1], widest]
+        nodes = np.concatenate([2 * nodes + 1, 2 * nodes + 2])
+        starts, stops = np.concatenate([starts, middles]), np.concatenate([middles, stops])
 
 
 def fit_palette(points: Float32, weights: Float32, *, size: int, max_rounds: int = 3) -> Float32:

@@ -44,7 +44,7 @@ def fit_codebook(values: Float32, weights: Float32 | None = None, *, size: int =
     ------
     Wu 1991, Optimal quantization by matrix searching; Panter and Dite 1951 (cube-root rule).
     """
-    from gsplat_tools.kernels.scalar_dp import cluster_bins, descend_sorted
+    from gsplat_tools.kernels.scalar_dp import cluster_bins
 
     if size < 2:
         raise ValueError(f"size must be at least 2, got {size}")
@@ -71,7 +71,7 @@ def fit_codebook(values: Float32, weights: Float32 | None = None, *, size: int =
     means = np.diff(prefix_sums[cuts]) / np.where(weight > 0, weight, 1)
     codebook = np.concatenate([points[:1], means, points[-1:]]) if spans else means
     codebook.sort()
-    descend_sorted(points, prefix_weights, prefix_sums, spans, spans, _DESCENT_ROUNDS, codebook)
+    _descend(points, prefix_weights, prefix_sums, spans, codebook)
     codebook = np.clip(np.sort(codebook) + center, values.min(), values.max())
     if spans:
         codebook[0], codebook[-1] = values.min(), values.max()
@@ -94,6 +94,30 @@ def _merge_equal(values: Float32, weights: Float32 | None) -> tuple[NDArray[np.f
     first = np.flatnonzero(np.concatenate([[True], ascending[1:] != ascending[:-1]]))
     summed = np.add.reduceat(np.ravel(weights)[order].astype(np.float64), first)
     return ascending[first].astype(np.float64), np.maximum(summed, np.finfo(np.float64).tiny)
+
+
+def _descend(
+    points: NDArray[np.float64],
+    prefix_weights: NDArray[np.float64],
+    prefix_sums: NDArray[np.float64],
+    keeps_ends: bool,
+    codebook: NDArray[np.float64],
+) -> None:
+    """Improve a codebook in place by Lloyd rounds; with prefix sums one costs a binary search an entry."""
+    for _ in range(_DESCENT_ROUNDS):
+        middles = (codebook[:-1] + codebook[1:]) / 2
+        cuts = np.concatenate([[0], np.searchsorted(points, middles), [len(points)]])
+        weights = np.diff(prefix_weights[cuts])
+        means = np.diff(prefix_sums[cuts]) / np.where(weights > 0, weights, 1)
+        # Differences of long prefix sums may leave the interval by rounding.
+        low, high = points[np.minimum(cuts[:-1], len(points) - 1)], points[np.maximum(cuts[1:] - 1, 0)]
+        moves = (weights > 0) & (np.diff(cuts) > 0)
+        if keeps_ends:
+            moves[[0, -1]] = False
+        updated = np.where(moves, np.clip(means, low, np.maximum(low, high)), codebook)
+        if np.array_equal(updated, codebook):
+            break
+        codebook[:] = updated
 
 
 def _bin_edges(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -25,59 +25,15 @@ def add_to_clusters(points, weights, labels, sums, totals):
             sums[k, d] += weight * np.float64(points[i, d])
 
 
-LEAF_SIZE = 8
-"""Centroids that are compared one by one at the bottom of a tree."""
-
-
-@kernel()
-def build_tree(centroids, order, axes, cuts):
-    """Balanced tree over centroids with three coordinates: each node halves its range along its widest axis.
-
-    centroids  float32 (K, 3)  read
-    order      int64 (K,)      written; centroids in the order of the leaves
-    axes       int64 (M,)      written; axis of node i, its children are 2 i + 1 and 2 i + 2, -1 for a leaf
-    cuts       float32 (M,)    written; left of the cut are coordinates of at most this
-    """
-    size = centroids.shape[0]
-    for k in range(size):
-        order[k] = k
-    axes[:] = -1
-    nodes = axes.shape[0]
-    starts, stops = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64)
-    stops[0] = size
-    values = np.empty(size, np.float32)
-    part = np.empty(size, np.int64)
-    for node in range(nodes):
-        start, stop = starts[node], stops[node]
-        if stop - start <= LEAF_SIZE:
-            continue
-        best, widest = np.float32(-1), 0
-        for axis in range(3):
-            low, high = np.float32(np.inf), np.float32(-np.inf)
-            for j in range(start, stop):
-                low = min(low, centroids[order[j], axis])
-                high = max(high, centroids[order[j], axis])
-            if high - low > best:
-                best, widest = high - low, axis
-        for j in range(start, stop):
-            values[j - start] = centroids[order[j], widest]
-            part[j - start] = order[j]
-        ranks = np.argsort(values[: stop - start], kind="mergesort")
-        for j in range(stop - start):
-            order[start + j] = part[ranks[j]]
-        middle = (start + stop) // 2
-        axes[node], cuts[node] = widest, centroids[order[middle - 1], widest]
-        starts[2 * node + 1], stops[2 * node + 1] = start, middle
-        starts[2 * node + 2], stops[2 * node + 2] = middle, stop
-
-
 @kernel()
 def nearest_in_tree(points, leaves, order, axes, cuts, start, stop, labels, distances):
     """Nearest centroid of points with three coordinates, exact.
 
     points     float32 (N, 3)  read
     leaves     float32 (K, 3)  read; centroids in the order of the leaves
-    order, axes, cuts          read; as `build_tree` writes them
+    order      int64 (K,)      read; index of each leaf's centroid
+    axes       int64 (M,)      read; axis of node i, whose children are 2 i + 1 and 2 i + 2, -1 for a leaf
+    cuts       float32 (M,)    read; left of the cut are coordinates of at most this; a node halves its range
     start, stop  int           rows to do
     labels     int64 (N,)      written; of equally near ones the centroid met first
     distances  float32 (N,)    written; squared distance

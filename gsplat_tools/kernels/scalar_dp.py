@@ -1,4 +1,4 @@
-"""Optimal one-dimensional clustering: dynamic programming over sorted bins, then exact local descent."""
+"""Optimal one-dimensional clustering: dynamic programming over sorted bins."""
 
 from __future__ import annotations
 
@@ -63,35 +63,3 @@ def cluster_bins(weights, sums, squares, num_clusters, bounds):
     for layer in range(num_clusters - 1, -1, -1):
         end = starts[layer, end] if layer > 0 else 0
         bounds[layer] = end
-
-
-@kernel()
-def descend_sorted(values, weights, sums, fixed_low, fixed_high, num_rounds, codebook):
-    """Lloyd rounds on sorted values with prefix sums: each round costs K binary searches, not N distances.
-
-    values         float64 (N,)      read; ascending
-    weights, sums  float64 (N + 1,)  read; prefix sums of w and w x
-    fixed_low      bool              whether codebook[0] stays
-    fixed_high     bool              whether codebook[K - 1] stays
-    num_rounds     int               at most this many
-    codebook       float64 (K,)      read and written; ascending
-    """
-    size = codebook.shape[0]
-    cuts = np.empty(size + 1, np.int64)
-    cuts[0], cuts[size] = 0, values.shape[0]
-    for _ in range(num_rounds):
-        for k in range(1, size):
-            cuts[k] = np.searchsorted(values, 0.5 * (codebook[k - 1] + codebook[k]))
-        moved = 0.0
-        for k in range(size):
-            if (k == 0 and fixed_low) or (k == size - 1 and fixed_high):
-                continue
-            weight = weights[cuts[k + 1]] - weights[cuts[k]]
-            if cuts[k + 1] > cuts[k] and weight > 0.0:
-                mean = (sums[cuts[k + 1]] - sums[cuts[k]]) / weight
-                # Differences of long prefix sums may leave the interval by rounding.
-                mean = min(max(mean, values[cuts[k]]), values[cuts[k + 1] - 1])
-                moved = max(moved, abs(mean - codebook[k]))
-                codebook[k] = mean
-        if moved == 0.0:
-            break
