@@ -143,7 +143,7 @@ def test_duplicate_name__is_read_as_the_last_entry() -> None:
     target = io.BytesIO(archive(valid_meta(), valid_files()))
     import zipfile
 
-    with pytest.warns(UserWarning), zipfile.ZipFile(target, "a") as bundle:  # zipfile's own
+    with pytest.warns(UserWarning, match="Duplicate name"), zipfile.ZipFile(target, "a") as bundle:  # zipfile's own
         bundle.writestr("meta.json", json.dumps(changed))
 
     with pytest.warns(GsplatWarning, match="last"):
