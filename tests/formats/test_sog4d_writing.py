@@ -16,7 +16,7 @@ from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarn
 from gsplat_tools.formats.sog4d import Sog4dOptions, Sog4dReadOptions, read, write
 from gsplat_tools.formats.sog4d.bounds import rotation_bound
 from gsplat_tools.formats.sog4d.codebooks import falling_frames, scale_coordinates, scales_at, turned
-from gsplat_tools.formats.sog4d.encode import constant_w_bytes
+from gsplat_tools.formats.sog4d.frame import constant_w_bytes
 from gsplat_tools.parallel import use_jobs
 from tests.clouds import random_cloud
 

@@ -1,10 +1,9 @@
-"""Cloud or sequence to bundle. Encoding a frame is a pure function of the frame, what is shared, and the labels before."""
+"""Cloud or sequence to bundle: fit what is shared, then encode, compress and write frame after frame."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -22,14 +21,12 @@ from gsplat_tools.formats.sog4d.codebooks import (
     check_finite,
     draw_sample,
     fit_shared,
-    scale_coordinates,
-    turned,
 )
 from gsplat_tools.formats.sog4d.decode import GENERATOR
+from gsplat_tools.formats.sog4d.frame import Previous, encode_frame
 from gsplat_tools.formats.sog4d.labels import Labels
 from gsplat_tools.formats.sog4d.meta import FRAME_TOKEN, Meta, PaletteMeta, Segment, frame_path, meta_text
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
-from gsplat_tools.formats.sog4d.textures import index_image, rgba_image
 from gsplat_tools.parallel import map_ordered
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
@@ -39,127 +36,6 @@ Float32 = NDArray[np.float32]
 PATHS = {
     name: f"frames/{FRAME_TOKEN}/{name}.webp" for name in ("position_hi", "position_lo", "scale_indices", "rotation", "sh0")
 }
-
-
-@dataclass(frozen=True, slots=True)
-class FramePlanes:
-    """One frame as images and labels, before compression.
-
-    Parameters
-    ----------
-    images
-        RGBA by stream name, labels included.
-    range_min, range_max
-        (3,) range of the positions.
-    labels
-        Scale indices under "scale", SH labels under the palette's name; the next frame of the segment starts from them.
-    clipped
-        Values that the sh0 codebook cannot reach, by what happened to them.
-    """
-
-    images: dict[str, Image]
-    range_min: Float32
-    range_max: Float32
-    labels: dict[str, Labels]
-    clipped: dict[str, int] = field(default_factory=dict)
-
-
-def encode_frame(cloud: GaussianCloud, shared: Shared, previous: dict[str, Labels] | None = None) -> FramePlanes:
-    """Quantize one frame.
-
-    Parameters
-    ----------
-    cloud
-        The frame, splats in the order of the bundle.
-    shared
-        Codebooks, palettes and options of the bundle.
-    previous
-        Labels of the frame before in the same segment; None starts a segment.
-    """
-    from gsplat_tools.codecs.scalar_codebook import nearest_entry
-
-    width, height = shared.width, shared.height
-    low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
-    codes = position_codes(cloud.means, low, high)
-    quats, log_scales = turned(cloud, shared.rotation_frames)
-    labels: dict[str, Labels] = {}
-    labels["scale"] = choose_labels(
-        scale_coordinates(log_scales), shared.scale_points, shared.scale_error, shared.options.keep_tolerance,
-        None if previous is None else previous["scale"],
-    )  # fmt: skip
-    colors = np.empty((len(cloud), 4), np.uint8)
-    colors[:, :3] = nearest_entry(cloud.sh0, shared.sh0_codebook)
-    colors[:, 3] = opacity_bytes(cloud.opacity_logits)
-    images = {
-        "position_hi": rgba_image((codes >> 8).astype(np.uint8), width, height),
-        "position_lo": rgba_image((codes & 0xFF).astype(np.uint8), width, height),
-        "scale_indices": index_image(labels["scale"], width, height),
-        "rotation": rgba_image(rotation_bytes(quats, shared), width, height),
-        "sh0": rgba_image(colors, width, height),
-    }
-    for palette in shared.palettes:
-        labels[palette.name] = choose_labels(
-            palette.rows(cloud), palette.centroids, palette.error, shared.options.keep_tolerance,
-            None if previous is None else previous[palette.name],
-        )  # fmt: skip
-        images[f"{palette.name}_labels"] = index_image(labels[palette.name], width, height)
-    outside = (cloud.sh0 < shared.sh0_codebook[0]) | (cloud.sh0 > shared.sh0_codebook[-1])
-    clipped = {"sh0": int(outside.any(axis=1).sum())} if outside.any() else {}
-    return FramePlanes(images, low, high, labels, clipped)
-
-
-def position_codes(means: Float32, low: Float32, high: Float32) -> NDArray[np.uint16]:
-    """Return round((x - min) / (max - min) 65535), 0 on a flat axis."""
-    span = high.astype(np.float64) - low
-    steps = 65535 / np.where(span > 0, span, 1.0)
-    return np.rint((means - low.astype(np.float64)) * steps).astype(np.uint16)
-
-
-def rotation_bytes(quats: Float32, shared: Shared) -> NDArray[np.uint8]:
-    """Return the bytes w x y z of quaternions in the frames that were chosen."""
-    from gsplat_tools.codecs import quaternion_u8
-
-    mode = shared.options.rotation
-    if mode != "small":
-        return quaternion_u8.encode(quats, mode=mode)
-    codes = constant_w_bytes(quats, shared.options.rotation_steps)
-    if shared.is_long is not None:
-        codes[shared.is_long] = quaternion_u8.encode(quats[shared.is_long], mode="best")
-    return codes
-
-
-def constant_w_bytes(quats: Float32, steps: int) -> NDArray[np.uint8]:
-    """Return quaternions with w as the same number of steps everywhere, so that one byte of four says nothing.
-
-    Where w is not the largest component (later frames of a sequence) the quaternion is shortened until all fit.
-    """
-    wide = quats.astype(np.float64)
-    wide *= np.where(wide[:, :1] < 0, -1.0, 1.0)
-    largest = np.abs(wide).max(axis=1, keepdims=True)
-    is_null = largest == 0
-    wide[is_null[:, 0]] = (1, 0, 0, 0)
-    # 127 steps for the largest component are the end of the byte.
-    scale = np.minimum(steps / np.maximum(wide[:, :1], 1e-30), 127 / np.where(is_null, 1.0, largest))
-    return (np.rint(wide * scale) + 128).astype(np.uint8)
-
-
-def opacity_bytes(logits: Float32) -> NDArray[np.uint8]:
-    """Return the opacity in 255ths, rounded."""
-    from gsplat_tools.attributes.activations import sigmoid
-
-    return np.rint(sigmoid(logits.astype(np.float64)) * 255).astype(np.uint8)
-
-
-def choose_labels(points: Float32, centroids: Float32, error: float, tolerance: float, previous: Labels | None) -> Labels:
-    """Return the nearest entry of every splat, or the one it had where that adds at most `tolerance` times `error`."""
-    from gsplat_tools.codecs.palette import nearest_labels
-
-    labels, distances = nearest_labels(points, centroids)
-    if previous is not None:
-        offsets = points - centroids[previous]
-        keeps = np.einsum("nd,nd->n", offsets, offsets) <= distances + np.float32(tolerance * error)
-        labels = np.where(keeps, previous, labels)
-    return labels.astype(np.uint16)
 
 
 def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: Sog4dOptions) -> None:
@@ -187,10 +63,11 @@ def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: So
     clipped: dict[str, int] = {}
 
     def images() -> Iterator[tuple[str, Image]]:
-        previous: dict[str, Labels] | None = None
+        previous: Previous | None = None
         starts = {start for start, _ in segments}
         for frame_id in range(len(frames)):
-            planes = encode_frame(frames[frame_id], shared, None if frame_id in starts else previous)
+            cloud = frames[frame_id]
+            planes = encode_frame(cloud, shared, None if frame_id in starts else previous)
             ranges.append((planes.range_min, planes.range_max))
             for name, number in planes.clipped.items():
                 clipped[name] = clipped.get(name, 0) + number
@@ -199,7 +76,7 @@ def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: So
             for name in sorted(planes.images):
                 if name in PATHS or deltas is None or frame_id in starts:
                     yield f"frames/{frame_id:05d}/{name}.webp", planes.images[name]
-            previous = planes.labels
+            previous = Previous(cloud, planes.labels)
 
     def compress(item: tuple[str, Image]) -> tuple[str, bytes]:
         name, image = item

@@ -1,0 +1,165 @@
+"""One frame to images: a pure function of the frame, what is shared, and the labels before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.formats._webp import Image
+from gsplat_tools.formats.sog4d.codebooks import Shared, scale_coordinates, turned
+from gsplat_tools.formats.sog4d.labels import Labels
+from gsplat_tools.formats.sog4d.textures import index_image, rgba_image
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class FramePlanes:
+    """One frame as images and labels, before compression.
+
+    Parameters
+    ----------
+    images
+        RGBA by stream name, labels included.
+    range_min, range_max
+        (3,) range of the positions.
+    labels
+        Scale indices under "scale", SH labels under the palette's name; the next frame of the segment starts from them.
+    clipped
+        Values that the sh0 codebook cannot reach, by what happened to them.
+    """
+
+    images: dict[str, Image]
+    range_min: Float32
+    range_max: Float32
+    labels: dict[str, Labels]
+    clipped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Previous:
+    """The frame before in the same segment, and the labels that it got."""
+
+    cloud: GaussianCloud
+    labels: dict[str, Labels]
+
+
+def encode_frame(cloud: GaussianCloud, shared: Shared, previous: Previous | None = None) -> FramePlanes:
+    """Quantize one frame.
+
+    Parameters
+    ----------
+    cloud
+        The frame, splats in the order of the bundle.
+    shared
+        Codebooks, palettes and options of the bundle.
+    previous
+        The frame before in the same segment; None starts a segment. The result depends on its labels alone: splats that
+        have not changed keep theirs without a search.
+    """
+    from gsplat_tools.codecs.scalar_codebook import nearest_entry
+
+    width, height = shared.width, shared.height
+    low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
+    codes = position_codes(cloud.means, low, high)
+    quats, log_scales = turned(cloud, shared.rotation_frames)
+    labels: dict[str, Labels] = {}
+    labels["scale"] = choose_labels(
+        scale_coordinates(log_scales),
+        shared.scale_points,
+        shared.options.keep_tolerance * shared.scale_error,
+        None if previous is None else previous.labels["scale"],
+        None if previous is None else (cloud.log_scales == previous.cloud.log_scales).all(axis=1),
+    )
+    colors = np.empty((len(cloud), 4), np.uint8)
+    colors[:, :3] = nearest_entry(cloud.sh0, shared.sh0_codebook)
+    colors[:, 3] = opacity_bytes(cloud.opacity_logits)
+    images = {
+        "position_hi": rgba_image((codes >> 8).astype(np.uint8), width, height),
+        "position_lo": rgba_image((codes & 0xFF).astype(np.uint8), width, height),
+        "scale_indices": index_image(labels["scale"], width, height),
+        "rotation": rgba_image(rotation_bytes(quats, shared), width, height),
+        "sh0": rgba_image(colors, width, height),
+    }
+    for palette in shared.palettes:
+        rows = palette.rows(cloud)
+        labels[palette.name] = choose_labels(
+            rows,
+            palette.centroids,
+            shared.options.keep_tolerance * palette.error,
+            None if previous is None else previous.labels[palette.name],
+            None if previous is None else (rows == palette.rows(previous.cloud)).all(axis=1),
+        )
+        images[f"{palette.name}_labels"] = index_image(labels[palette.name], width, height)
+    outside = (cloud.sh0 < shared.sh0_codebook[0]) | (cloud.sh0 > shared.sh0_codebook[-1])
+    clipped = {"sh0": int(outside.any(axis=1).sum())} if outside.any() else {}
+    return FramePlanes(images, low, high, labels, clipped)
+
+
+def position_codes(means: Float32, low: Float32, high: Float32) -> NDArray[np.uint16]:
+    """Return round((x - min) / (max - min) 65535), 0 on a flat axis."""
+    span = high.astype(np.float64) - low
+    steps = 65535 / np.where(span > 0, span, 1.0)
+    return np.rint((means - low.astype(np.float64)) * steps).astype(np.uint16)
+
+
+def rotation_bytes(quats: Float32, shared: Shared) -> NDArray[np.uint8]:
+    """Return the bytes w x y z of quaternions in the frames that were chosen."""
+    from gsplat_tools.codecs import quaternion_u8
+
+    mode = shared.options.rotation
+    if mode != "small":
+        return quaternion_u8.encode(quats, mode=mode)
+    codes = constant_w_bytes(quats, shared.options.rotation_steps)
+    if shared.is_long is not None:
+        codes[shared.is_long] = quaternion_u8.encode(quats[shared.is_long], mode="best")
+    return codes
+
+
+def constant_w_bytes(quats: Float32, steps: int) -> NDArray[np.uint8]:
+    """Return quaternions with w as the same number of steps everywhere, so that one byte of four says nothing.
+
+    Where w is not the largest component (later frames of a sequence) the quaternion is shortened until all fit.
+    """
+    wide = quats.astype(np.float64)
+    wide *= np.where(wide[:, :1] < 0, -1.0, 1.0)
+    largest = np.abs(wide).max(axis=1, keepdims=True)
+    is_null = largest == 0
+    wide[is_null[:, 0]] = (1, 0, 0, 0)
+    # 127 steps for the largest component are the end of the byte.
+    scale = np.minimum(steps / np.maximum(wide[:, :1], 1e-30), 127 / np.where(is_null, 1.0, largest))
+    return (np.rint(wide * scale) + 128).astype(np.uint8)
+
+
+def opacity_bytes(logits: Float32) -> NDArray[np.uint8]:
+    """Return the opacity in 255ths, rounded."""
+    from gsplat_tools.attributes.activations import sigmoid
+
+    return np.rint(sigmoid(logits.astype(np.float64)) * 255).astype(np.uint8)
+
+
+def choose_labels(
+    points: Float32,
+    centroids: Float32,
+    tolerance: float,
+    previous: Labels | None,
+    is_unchanged: NDArray[np.bool_] | None = None,
+) -> Labels:
+    """Return the nearest entry of every splat, or the one it had where that adds at most `tolerance` to the square error."""
+    from gsplat_tools.codecs.palette import nearest_labels
+
+    if previous is None:
+        return nearest_labels(points, centroids)[0].astype(np.uint16)
+    chosen = previous.copy()
+    rows = np.arange(len(points)) if is_unchanged is None else np.flatnonzero(~is_unchanged)
+    if len(rows) == 0:
+        return chosen
+    moved = points[rows]
+    labels, distances = nearest_labels(moved, centroids)
+    offsets = moved - centroids[previous[rows]]
+    keeps = np.einsum("nd,nd->n", offsets, offsets) <= distances + np.float32(tolerance)
+    chosen[rows] = np.where(keeps, previous[rows], labels)
+    return chosen
