@@ -6,6 +6,8 @@ import pytest
 from gsplat_tools.kernels import accumulator
 from gsplat_tools.kernels import rules as R
 
+pytestmark = pytest.mark.uncompiled
+
 COUNT = 2000
 EYE = np.array([0.3, -1.0, 2.0])
 

@@ -7,6 +7,8 @@ import pytest
 
 from gsplat_tools.kernels.columns import gather_rows, scatter_rows
 
+pytestmark = pytest.mark.uncompiled
+
 
 def empty_arrays(count, num_rest):
     shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 3), (count, num_rest, 3)]

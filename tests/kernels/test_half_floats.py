@@ -1,7 +1,10 @@
 import numpy as np
+import pytest
 from numba import njit
 
 from gsplat_tools.kernels.half_floats import round_to_half
+
+pytestmark = pytest.mark.uncompiled
 
 
 @njit()

@@ -5,6 +5,8 @@ import pytest
 
 from gsplat_tools.kernels import radix_sort
 
+pytestmark = pytest.mark.uncompiled
+
 
 def words_of(keys, payload):  # type: ignore[no-untyped-def]
     return (keys.astype(np.uint64) << np.uint64(32)) | payload

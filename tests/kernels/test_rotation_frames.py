@@ -1,6 +1,9 @@
 import numpy as np
+import pytest
 
 from gsplat_tools.kernels import rotation_frames
+
+pytestmark = pytest.mark.uncompiled
 
 
 def matrices(quats):

@@ -6,6 +6,8 @@ import pytest
 from gsplat_tools.kernels.sh_eval import BAND_4_FIRST, evaluate_basis
 from gsplat_tools.reference.models import MODELS
 
+pytestmark = pytest.mark.uncompiled
+
 
 def quadrature():  # type: ignore[no-untyped-def]
     """Directions and weights that integrate polynomials up to degree 11 over the sphere exactly."""
