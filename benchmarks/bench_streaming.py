@@ -63,6 +63,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("--splats", type=int, default=13_600_000)
     parser.add_argument("--keep", type=Path)
+    parser.add_argument("--to", action="append", help="only these targets")
     arguments = parser.parse_args()
     print(describe_machine())
     with tempfile.TemporaryDirectory(dir=arguments.keep) as folder:
@@ -82,6 +83,8 @@ def main() -> None:
             ("gscc", ["--no-validate", "--source-coordinates", "RUB"]),
             ("ply", ["--no-validate"]),
         ):
+            if arguments.to and name not in arguments.to:
+                continue
             target = Path(folder) / "out.bin"
             command = [
                 str(Path(sys.executable).parent / "gsplat-convert"), str(source), str(target), "--to", name,
