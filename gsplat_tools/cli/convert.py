@@ -38,6 +38,8 @@ FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("--sh-palette-size", "sh_palette_size", {"type": click.IntRange(1, 65536), "help": "Entries of the SH palette."}),
     ("--centroids", "centroids", {"type": click.Choice(["f16", "f32"]), "help": "Type of the SH palette."}),
     ("--sh0-codebook", "sh0_codebook", {"type": click.Choice(["base-rgb", "fit"]), "help": "Fixed or fitted base colors."}),
+    ("--layout-width", "width", {"type": click.IntRange(min=1), "help": "Width of the images, px."}),
+    ("--layout-height", "height", {"type": click.IntRange(min=1), "help": "Height of the images, px."}),
     ("--webp-effort", "webp_effort", {"type": click.IntRange(0, 9), "help": "Effort of the lossless WebP images."}),
     ("--zip", "zip", {"type": click.Choice(["auto", "stored", "deflated"]), "help": "auto: images stored, the rest deflated."}),
     ("--sh1-bits", "sh1_bits", {"type": click.IntRange(1, 8), "help": "Bits of SH values of band 1."}),
