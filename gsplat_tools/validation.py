@@ -116,8 +116,10 @@ def _issues(stream: BinaryIO, record: Format) -> Iterator[Issue]:
             cloud = scene.frame(frame_id) if isinstance(scene, GaussianSequence) else scene
             yield from _remarks(cloud, frame_id if frames > 1 else None)
     except FormatError as error:
+        # A reader that goes by rules says which one was broken.
+        code = str(getattr(error, "code", "unreadable"))
         yield Issue(
-            code="unreadable",
+            code=code if code in record.rules else "unreadable",
             message=error.message,
             field=error.field,
             frame=error.frame,

@@ -36,7 +36,7 @@ def _module(name: str) -> Path:
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
     if not folder.is_dir():
-        pytest.skip(f"{name} is not installed (scripts/peers, or GSPLAT_TOOLS_NODE_MODULES)")
+        pytest.skip(f"{name} is not installed (npm install {name}, then GSPLAT_TOOLS_NODE_MODULES names its folder)")
     return folder
 
 

@@ -109,6 +109,7 @@ FORMAT = Format(
     inspect=inspect,
     read=read,
     write=write,
+    rules=RULES,
     bounds=_bounds,
     stores_splat_model=True,
     order="morton",
