@@ -228,9 +228,11 @@ def render(file: Path, *, target: Path | None, jobs: int | None, as_json: bool, 
     if as_json:
         output.print_json(report)
     else:
-        drawn = ", ".join(output.count(view["drawn"]) for view in report["views"])
+        drawn = [view["drawn"] for view in report["views"]]
         model = report["model"] + (f" {report['variant']}" if report["variant"] else "")
-        click.echo(f"{report['picture']}: {len(report['views'])} views, model {model}, splats drawn {drawn}", err=True)
+        files = ", ".join(name for name in (report["picture"], report["animation"]) if name)
+        splats = output.count(min(drawn)) + ("" if min(drawn) == max(drawn) else f" to {output.count(max(drawn))}")
+        click.echo(f"{files}: {len(drawn)} views, model {model}, splats drawn {splats}", err=True)
 
 
 @main.command()
