@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
@@ -199,11 +199,3 @@ def empty_cloud(count: int, sh_degree: int, *, has_motion: bool = False) -> Gaus
         for name, width in (_WIDTHS | (_MOTION_WIDTHS if has_motion else {})).items()
     }
     return GaussianCloud(**arrays, shN=np.empty((count, REST_COEFFICIENTS[sh_degree], 3), np.float32))
-
-
-METADATA_FIELDS = tuple(
-    f.name
-    for f in fields(GaussianCloud)
-    if f.name in {"time_model", "temporal_cutoff", "coordinate_system", "origin", "splat_model"}
-)
-"""Fields that describe the cloud as a whole."""

@@ -23,6 +23,7 @@ Messages say what was expected, what was found, and what to do; where it was is 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 
@@ -139,3 +140,8 @@ class NonFiniteWarning(GsplatWarning):
     """Values that are not finite were found; the splats that hold them were dropped."""
 
     code = "non-finite"
+
+
+def counts_in_words(counts: Mapping[str, int]) -> str:
+    """Return causes and how often each was found, as one phrase."""
+    return ", ".join(f"{cause} {count}" for cause, count in counts.items())

@@ -12,6 +12,7 @@ import click
 from gsplat_tools.cli import _options as options
 from gsplat_tools.cli import _output as output
 from gsplat_tools.cli._errors import one_line, reports_errors
+from gsplat_tools.errors import counts_in_words
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.preparing import SaveChoices
 from gsplat_tools.formats.registry import FORMATS
@@ -297,7 +298,7 @@ def _summary(report: dict[str, Any]) -> str:
         + ")",
     ]
     if report["dropped"]:
-        lines.append("  dropped: " + ", ".join(f"{cause} {count}" for cause, count in report["dropped"].items()))
+        lines.append(f"  dropped: {counts_in_words(report['dropped'])}")
     validation = report["validation"]
     if validation is None:
         return "\n".join([*lines, "  not validated"])

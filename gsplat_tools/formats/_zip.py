@@ -176,8 +176,3 @@ class ZipWriter:
     def close(self) -> None:
         """Write the directory."""
         self._archive.close()
-
-
-def starts_like_zip(head: bytes) -> bool:
-    """Whether a file begins with a local entry or an empty directory of a ZIP archive."""
-    return head[:4] in {b"PK\x03\x04", b"PK\x05\x06"}

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, UnknownFormatError
+from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, UnknownFormatError, counts_in_words
 from gsplat_tools.formats._stream import seekable
 from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format
 from gsplat_tools.formats.registry import detect, find_format
@@ -130,7 +130,7 @@ def drop_or_refuse(cloud: GaussianCloud, *, strict: bool) -> GaussianCloud:
 def warn_dropped(dropped: dict[str, int], count: int) -> None:
     """Warn about invalid splats that were dropped, if any."""
     if dropped:
-        causes = ", ".join(f"{cause} {number}" for cause, number in dropped.items())
+        causes = counts_in_words(dropped)
         warnings.warn(
             NonFiniteWarning(f"dropped {sum(dropped.values())} of {count} splats that are invalid: {causes}"), stacklevel=3
         )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gsplat_tools.attributes.coordinate_systems import is_known
 from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import CapabilityError, CloudError, GsplatWarning, LossyConversionWarning
+from gsplat_tools.errors import CapabilityError, CloudError, GsplatWarning, LossyConversionWarning, counts_in_words
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import warn_dropped
 from gsplat_tools.progress import stage
@@ -161,28 +161,33 @@ def _prepare_sequence(sequence: GaussianSequence, target: Format, choices: SaveC
 
     first = sequence.frame(0)
     keeps = np.ones(sequence.num_splats, np.bool_)
-    visible = np.zeros(sequence.num_splats, np.bool_)
+    visible = np.full(sequence.num_splats, choices.prune_opacity == 0)
     causes: Counter[str] = Counter()
+    scan = _Scan(num_splats=sequence.num_splats)
     with stage("checking frames", len(sequence), "frames") as progress:
         for frame_id in range(len(sequence)):
             frame = first if frame_id == 0 else sequence.frame(frame_id)
             is_valid, dropped = classify_invalid(frame)
             if dropped and choices.strict:
-                raise CloudError(f"invalid splats: {_counts(dropped)}", frame=frame_id)
+                raise CloudError(f"invalid splats: {counts_in_words(dropped)}", frame=frame_id)
             if dropped:
                 newly = classify_invalid(frame.take(keeps))[1]
                 causes.update(newly)
             keeps &= is_valid
-            visible |= _is_at_least(frame, choices.prune_opacity)
+            if choices.prune_opacity > 0:
+                visible |= _is_at_least(frame, choices.prune_opacity)
+            scan.add(frame)
             progress.advance(1)
     warn_dropped(dict(causes), sequence.num_splats)
     pruned = int(np.count_nonzero(keeps & ~visible))
     if pruned:
         causes["pruned-opacity"] = pruned
     keeps &= visible
-    scan = _Scan(num_splats=sequence.num_splats, dropped=causes)
-    for frame_id in range(len(sequence)):
-        scan.add(sequence.frame(frame_id).take(keeps) if frame_id else first.take(keeps))
+    if not keeps.all():  # what was found holds for all splats; look again at those that stay
+        scan = _Scan(num_splats=sequence.num_splats)
+        for frame_id in range(len(sequence)):
+            scan.add((sequence.frame(frame_id) if frame_id else first).take(keeps))
+    scan.dropped = causes
     fit = _Fit(first.take(slice(0, 0)), target, choices, scan)
     fitted = fit.apply(first.take(keeps))
     order = choices.order or target.order
@@ -219,7 +224,7 @@ def _scan(chunks: CloudChunks, choices: SaveChoices) -> _Scan:
     invalid = {cause: count for cause, count in scan.dropped.items() if cause != "pruned-opacity"}
     if choices.strict and invalid:
         raise CloudError(
-            f"{sum(invalid.values())} of {scan.num_splats} splats would be dropped: {_counts(invalid)}; "
+            f"{sum(invalid.values())} of {scan.num_splats} splats would be dropped: {counts_in_words(invalid)}; "
             "repair them or leave out --strict"
         )
     warn_dropped(invalid, scan.num_splats)
@@ -237,10 +242,6 @@ def _clean(chunk: GaussianCloud, choices: SaveChoices, dropped: Counter[str] | N
         if pruned:
             dropped["pruned-opacity"] += pruned
     return kept
-
-
-def _counts(counts: dict[str, int]) -> str:
-    return ", ".join(f"{cause} {count}" for cause, count in counts.items())
 
 
 class _Fit:

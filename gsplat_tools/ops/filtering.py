@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import CloudError
+from gsplat_tools.errors import CloudError, counts_in_words
 from gsplat_tools.parallel import run_blocks
 
 # Which infinities are legal, as kernels.validity numbers them; that module is imported where it runs.
@@ -69,7 +69,7 @@ def refuse_invalid(cloud: GaussianCloud) -> None:
     """
     keeps, dropped = classify_invalid(cloud)
     if dropped:
-        causes = ", ".join(f"{cause} {count}" for cause, count in dropped.items())
+        causes = counts_in_words(dropped)
         raise CloudError(
             f"{sum(dropped.values())} of {len(cloud)} splats are invalid: {causes}; the first is splat {int(np.argmin(keeps))}"
             "; repair them, or leave out --strict to drop them",
