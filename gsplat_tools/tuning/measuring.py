@@ -6,10 +6,11 @@ same cameras, so that a point is what a user of those settings would get.
 
 from __future__ import annotations
 
+import ctypes
 import tempfile
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -35,6 +36,7 @@ RENDERED_FRAMES = 3
 
 Model = tuple[str, str | None]
 Picture = NDArray[np.floating[Any]]
+See = Callable[[Picture, Picture], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +151,7 @@ class Workbench:
         """Return the rendering model that candidates of a format are drawn by."""
         return self._model or record.model
 
-    def measure(self, setting: Setting, *, repeats: int = 1, draw: bool = True, keep: Path | None = None) -> Point:
+    def measure(self, setting: Setting, *, repeats: int = 1, draw: bool = True, see: See | None = None) -> Point:
         """Write, read back and draw the scene with a setting.
 
         Parameters
@@ -160,8 +162,8 @@ class Workbench:
             Encodings and decodings to take the median time of; the first is warm only if kernels were used before.
         draw
             Whether pictures are compared.
-        keep
-            File to keep the encoding in; by default it is thrown away.
+        see
+            Called with the worst view of the source and of the candidate.
 
         Raises
         ------
@@ -179,7 +181,7 @@ class Workbench:
         encode, decode = list[float](), list[float]()
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            path = keep or Path(folder) / f"candidate{record.extensions[0]}"
+            path = Path(folder) / f"candidate{record.extensions[0]}"
             for _ in range(repeats):
                 resident = _reset_peak()
                 report = save(
@@ -201,7 +203,7 @@ class Workbench:
         for before, after in zip(written, frames, strict=True):
             tally.add(before, after)
         likeness = (
-            self.compare(frames, self.model_of(record), written[0].coordinate_system) if draw and len(frames[0]) else None
+            self.compare(frames, self.model_of(record), written[0].coordinate_system, see) if draw and len(frames[0]) else None
         )
         return Point(
             setting=setting,
@@ -218,7 +220,9 @@ class Workbench:
             warnings=sorted({each.message.code for each in caught if isinstance(each.message, GsplatWarning)}),
         )
 
-    def compare(self, frames: Sequence[GaussianCloud], model: Model, system: str | None = None) -> Likeness:
+    def compare(
+        self, frames: Sequence[GaussianCloud], model: Model, system: str | None = None, see: See | None = None
+    ) -> Likeness:
         """Draw frames (one cloud for a still scene) and compare them with the source's.
 
         Parameters
@@ -229,32 +233,27 @@ class Workbench:
             Rendering model and variant.
         system
             Axes that the frames are in; by default the scene's. "unknown" says that they were left as they were.
+        see
+            Called with the worst view of the source and of the candidate.
         """
         from gsplat_tools.reference import image_metrics
 
         cameras, references = self._reference(model, system)
-        metrics = [
-            image_metrics.compare_images(reference, image)
-            for reference, image in zip(references, self._draw(frames, cameras, model), strict=True)
-        ]
+        images = self._draw(frames, cameras, model)
+        metrics = [image_metrics.compare_images(*pair) for pair in zip(references, images, strict=True)]
         levels = [np.inf if each.psnr is None else each.psnr for each in metrics]
         finite = [level for level in levels if np.isfinite(level)]
         similarities = [each.ssim for each in metrics if each.ssim is not None]
+        worst = int(np.argmin(levels))
+        if see is not None:
+            see(references[worst], images[worst])
         return Likeness(
             psnr_min=min(finite) if finite else None,
             psnr_mean=float(np.mean(finite)) if finite else None,
             ssim_mean=float(np.mean(similarities)) if similarities else None,
             max_abs=max(each.max_abs for each in metrics),
-            worst_view=int(np.argmin(levels)),
+            worst_view=worst,
         )
-
-    def pictures(
-        self, frames: Sequence[GaussianCloud], model: Model, view: int, system: str | None = None
-    ) -> tuple[Picture, Picture]:
-        """Return the picture of the source and of a candidate in one view, as `Likeness.worst_view` counts them."""
-        cameras, references = self._reference(model, system)
-        frame, camera = divmod(view, len(cameras))
-        return references[view], self._draw([frames[frame]], [cameras[camera]], model)[0]
 
     def source_frames(self, system: str | None = None) -> list[GaussianCloud]:
         """Return the frames of the source that are drawn, one for a still scene, in the axes of a candidate."""
@@ -313,7 +312,8 @@ def _status(name: str) -> int | None:
 def _reset_peak() -> int | None:
     """Start counting peak memory anew and return what is resident now, bytes; None where the system cannot."""
     try:
+        ctypes.CDLL(None).malloc_trim(0)  # memory that is kept for reuse would hide what the next encoding needs
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
+    except (OSError, AttributeError):
         return None
     return _status("VmRSS")
