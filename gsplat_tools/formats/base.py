@@ -71,6 +71,26 @@ class FileInfo:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FolderLayout:
+    """How a bundle becomes the files of a folder.
+
+    Parameters
+    ----------
+    index
+        Name of the file that stands for the folder.
+    unpack
+        From the stream of a bundle, and a function from the wanted name and the bytes of a file to the name that it gets,
+        to the bytes of the index.
+    named_files
+        From the bytes of an index to the names of the files that it needs.
+    """
+
+    index: str
+    unpack: Callable[[BinaryIO, Callable[[str, bytes], str]], bytes]
+    named_files: Callable[[bytes], list[str]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Format:
     """One file format: capabilities as data, that help, documents and tests read, and its functions.
 
@@ -115,6 +135,8 @@ class Format:
         Stream to everything that is wrong with it, data decoded; None where reading the file is all there is to check.
     rules
         Every code that `check` may give, with its severity.
+    folder
+        How a target can be a folder's files, which one of a fixed name stands for; None where a target is one file.
     repair
         Stream of a file and stream to write: a file of today's spelling with the same content; None where there is
         nothing to repair.
@@ -145,6 +167,7 @@ class Format:
     holds_sequences: bool = False
     holds_motion: bool = False
     holds_extra: bool = False
+    folder: FolderLayout | None = None
     fits_sequences: bool = False
     stores_origin: bool = False
     stores_coordinates: bool = False

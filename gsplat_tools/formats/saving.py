@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,6 +12,7 @@ from typing import Any, BinaryIO
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.formats._folder import folder_size, replacing_folder
 from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import located
@@ -61,7 +63,7 @@ def find_target(path: Path, to: str | None) -> Format:
     CapabilityError
         The format is unknown, or has no writer.
     """
-    record = find_format(to) if to is not None else format_of_extension(path)
+    record = find_format(to) if to is not None else format_of_extension(path) or _format_of_index(path)
     if record is None:
         extensions = sorted({e for r in FORMATS.values() if r.write is not None for e in r.extensions})
         raise CapabilityError(
@@ -70,6 +72,18 @@ def find_target(path: Path, to: str | None) -> Format:
     if record.write is None:
         raise CapabilityError(f"{record.title} can be read but not written", path=path)
     return record
+
+
+def _format_of_index(path: Path) -> Format | None:
+    """Return the format whose folders a file of this name stands for."""
+    return next((record for record in FORMATS.values() if record.folder is not None and record.folder.index == path.name), None)
+
+
+def _replacing(path: Path, record: Format, *, overwrite: bool) -> AbstractContextManager[BinaryIO]:
+    """Open what takes the place of a target: one file, or the files of a folder."""
+    if record.folder is not None and path.name == record.folder.index:
+        return replacing_folder(path, record.folder, overwrite=overwrite)
+    return replacing(path, overwrite=overwrite)
 
 
 def count_splats(scene: Scene) -> int:
@@ -151,7 +165,7 @@ def save(
     record = find_target(path, to)
     choices, write_options = split_options(record, preset, options)
     assert record.write is not None
-    with located(path), replacing(path, overwrite=overwrite) as stream:
+    with located(path), _replacing(path, record, overwrite=overwrite) as stream:
         start = time.perf_counter()
         prepared = prepare(scene, record, choices)
         prepared_at = time.perf_counter()
@@ -167,6 +181,8 @@ def save(
             check(stream, prepared, record)
         checked_at = time.perf_counter()
     done = time.perf_counter()
+    if record.folder is not None and path.name == record.folder.index:
+        size = folder_size(path, record.folder)
     final = prepared.scene
     return SaveReport(
         path=path,

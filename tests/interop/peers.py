@@ -33,8 +33,8 @@ np.savez(target, means=data.means, log_scales=data.scales, quats=data.quats, opa
 
 _WRITE_WITH_GSPLY = """
 import sys, gsply
-source, target = sys.argv[1:]
-gsply.write_spz(target, gsply.plyread(source))
+source, target, version = sys.argv[1:]
+gsply.write_spz(target, gsply.plyread(source), version=int(version))
 """
 
 
@@ -101,12 +101,12 @@ def read_with_adobe_spz(path: Path, system: str) -> dict[str, np.ndarray]:
     }
 
 
-def _run_gsply(script: str, source: Path, target: Path) -> None:
+def _run_gsply(script: str, *arguments: str | Path) -> None:
     """Run a few lines of Python where gsply is installed."""
     if not GSPLY_PYTHON.exists():
         stop_without("gsply")
     done = subprocess.run(
-        [GSPLY_PYTHON, "-c", script, str(source), str(target)], capture_output=True, text=True, check=False, timeout=120
+        [GSPLY_PYTHON, "-c", script, *map(str, arguments)], capture_output=True, text=True, check=False, timeout=120
     )
     assert done.returncode == 0, done.stderr[-500:]
 
@@ -119,6 +119,6 @@ def read_with_gsply(path: Path) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
-def write_spz_with_gsply(source: Path, target: Path) -> None:
-    """Write a PLY as SPZ."""
-    _run_gsply(_WRITE_WITH_GSPLY, source, target)
+def write_spz_with_gsply(source: Path, target: Path, version: int) -> None:
+    """Write a PLY as SPZ 3 or 4."""
+    _run_gsply(_WRITE_WITH_GSPLY, source, target, str(version))

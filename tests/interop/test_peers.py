@@ -25,10 +25,10 @@ def write(cloud: GaussianCloud, path: Path, **options: object) -> None:
         save(cloud, path, order="none", **options)
 
 
-def read(path: Path) -> GaussianCloud:
+def read(path: Path, **options: object) -> GaussianCloud:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GsplatWarning)
-        cloud = load(path)
+        cloud = load(path, **options)
     assert isinstance(cloud, GaussianCloud)
     return cloud
 
@@ -54,6 +54,13 @@ def largest_differences(ours: GaussianCloud, theirs: GaussianCloud | Mapping[str
 
 
 ROUNDING = {"means": 1e-6, "log_scales": 2e-6, "sh0": 1e-6, "shN": 1e-6, "opacities": 2e-6, "rotations": 2e-6}
+
+
+SOG_ROTATIONS = 2e-6
+
+
+def sorted_by_position(cloud: GaussianCloud) -> GaussianCloud:
+    return cloud.take(np.lexsort(cloud.means.T))
 
 
 def assert_same(ours: GaussianCloud, theirs: GaussianCloud | Mapping[str, np.ndarray], **changes: float) -> None:
@@ -149,3 +156,62 @@ def test_our_files__are_read_by_gsply(name: str, tmp_path: Path) -> None:
     write(random_cloud(COUNT, sh_degree=3), path, **options)
 
     assert_same(read(path), peers.read_with_gsply(path), opacities=1 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_spz_of_gsply__is_read_by_us(version: int, tmp_path: Path) -> None:
+    source, path = tmp_path / "a.ply", tmp_path / "a.spz"
+    write(random_cloud(COUNT, sh_degree=2), source)
+
+    peers.write_spz_with_gsply(source, path, version)
+
+    assert_same(read(path), peers.read_with_gsply(path), opacities=1 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("name", ["a.sog", "meta.json"])
+def test_our_sog__is_read_by_splat_transform(sh_degree: int, name: str, tmp_path: Path) -> None:
+    path, back = tmp_path / "scene" / name, tmp_path / "a.ply"
+    path.parent.mkdir()
+    write(random_cloud(COUNT, sh_degree=sh_degree).replace(splat_model="antialiased"), path)
+
+    peers.splat_transform(path, back)
+
+    theirs = read(back)
+    assert theirs.splat_model == "antialiased"
+    assert_same(read(path), theirs, rotations=SOG_ROTATIONS)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_our_sog__is_read_by_gsply(sh_degree: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.sog"
+    write(random_cloud(COUNT, sh_degree=sh_degree), path)
+
+    assert_same(read(path), peers.read_with_gsply(path), rotations=SOG_ROTATIONS)
+
+
+@pytest.mark.parametrize("name", ["a.sog", "meta.json"])
+def test_sog_of_splat_transform__is_read_by_us(name: str, tmp_path: Path) -> None:
+    source, path, back = tmp_path / "a.ply", tmp_path / "scene" / name, tmp_path / "b.ply"
+    path.parent.mkdir()
+    write(random_cloud(COUNT, sh_degree=2), source)
+
+    peers.splat_transform(source, path)
+    peers.splat_transform(path, back)
+
+    assert_same(read(path), read(back), rotations=SOG_ROTATIONS)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_levels_of_splat_transform__are_read_by_us(level: int, tmp_path: Path) -> None:
+    sources, path, back = [tmp_path / "0.ply", tmp_path / "1.ply"], tmp_path / "lod" / "lod-meta.json", tmp_path / "b.ply"
+    path.parent.mkdir()
+    for seed, source in enumerate(sources):
+        write(random_cloud(COUNT // (1 + seed), sh_degree=1, seed=seed), source)
+
+    peers.splat_transform(sources[0], "--tag-lod", "0", sources[1], "--tag-lod", "1", path)
+    peers.splat_transform("--select-lod", str(level), path, back)
+
+    ours, theirs = read(path, lod=level), read(back)
+    assert len(ours) == COUNT // (1 + level)
+    assert_same(sorted_by_position(ours), sorted_by_position(theirs), rotations=SOG_ROTATIONS)

@@ -20,6 +20,7 @@ from gsplat_tools.formats.sog import lod
 from gsplat_tools.formats.sog.bundle import Bundle, open_bundle
 from gsplat_tools.formats.sog.decode import read
 from gsplat_tools.formats.sog.encode import write
+from gsplat_tools.formats.sog.folder import FOLDER
 from gsplat_tools.formats.sog.options import SogOptions, SogReadOptions
 from gsplat_tools.formats.sog.rules import RULES
 
@@ -110,6 +111,7 @@ FORMAT = Format(
     read=read,
     write=write,
     rules=RULES,
+    folder=FOLDER,
     bounds=_bounds,
     stores_splat_model=True,
     order="morton",
