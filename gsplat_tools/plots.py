@@ -131,11 +131,11 @@ class _Axis:
     def _round_values(self, low: float, high: float) -> list[float]:
         if self._is_log:
             decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-            step = max(1, len(decades) // 8)
+            every = max(1, len(decades) // 8)
             factors = (1, 2, 5) if math.log10(high / low) < _DECADES_WITH_HALVES else (1,)
-            return [factor * 10.0**decade for decade in decades[::step] for factor in factors]
+            return [factor * 10.0**decade for decade in decades[::every] for factor in factors]
         rough = (high - low) / 6
         scale = 10.0 ** math.floor(math.log10(rough))
-        step = next(factor * scale for factor in (1, 2, 5, 10) if factor * scale >= rough)
+        step = next(factor * scale for factor in (1.0, 2.0, 5.0, 10.0) if factor * scale >= rough)
         first = math.ceil(low / step)
         return [round(k * step, 12) for k in range(first, math.floor(high / step) + 1)]

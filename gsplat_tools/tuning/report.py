@@ -90,11 +90,11 @@ def tradeoff_files(
         if wanted is not None and wanted.exists() and not overwrite:
             raise TargetExistsError("the target is there already; use --overwrite to replace it", path=wanted)
     found = measure_tradeoff(load(path), **choices)
-    texts = ((target, lambda: html_report(found, path.name, describe_machine())), (csv_target, found.to_csv))
-    for wanted, make in texts:
+    for wanted, is_page in ((target, True), (csv_target, False)):
         if wanted is not None:
+            text = html_report(found, path.name, describe_machine()) if is_page else found.to_csv()
             with replacing(wanted, overwrite=overwrite) as stream:
-                stream.write(make().encode("utf-8"))
+                stream.write(text.encode("utf-8"))
     return {"file": str(path), **found.to_json()}
 
 
