@@ -15,9 +15,6 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CloudError
 from gsplat_tools.formats.base import Bounds
 
-_FLOAT32_SLACK = 4e-7
-"""Decoders compute in float32: a few roundings of 2^-24 relative to the value come on top of a bound."""
-
 
 @dataclass(slots=True)
 class AttributeStatistics:
@@ -40,8 +37,8 @@ class AttributeStatistics:
     bound: float | None = None
     exceeded: int = 0
 
-    def add(self, errors: NDArray[np.float64], bound: NDArray[Any] | None, slack: NDArray[np.float64] | float = 0.0) -> None:
-        """Take the errors of one more chunk into account; `slack` is what a decoder's arithmetic may add to the bound."""
+    def add(self, errors: NDArray[np.float64], bound: NDArray[Any] | None) -> None:
+        """Take the errors of one more chunk into account."""
         if errors.size == 0:
             return
         self.count += errors.size
@@ -50,7 +47,7 @@ class AttributeStatistics:
         self.sum_squares += float(np.square(errors).sum())
         if bound is not None:
             self.bound = max(self.bound or 0.0, float(bound.max(initial=0.0, where=np.isfinite(bound))))
-            self.exceeded += int(np.count_nonzero(~(errors <= bound + slack)))
+            self.exceeded += int(np.count_nonzero(~(errors <= bound)))
 
     def to_json(self) -> dict[str, float | int | None]:
         """Return max, mean, rms, bound and exceeded; numbers that are not finite become None."""
@@ -92,9 +89,8 @@ def attribute_errors(reference: GaussianCloud, candidate: GaussianCloud) -> dict
     sorted_a, sorted_b = np.sort(reference.log_scales, axis=1), np.sort(candidate.log_scales, axis=1)
     with np.errstate(invalid="ignore"):
         scales = np.where(sorted_a == sorted_b, 0.0, np.abs(sorted_a.astype(np.float64) - sorted_b))
-    opacities = np.abs(
-        activations.sigmoid(reference.opacity_logits).astype(np.float64) - activations.sigmoid(candidate.opacity_logits)
-    )
+    # Sigmoids in float64: rounded to float32, they would differ by 6e-8 of their own.
+    opacities = np.abs(np.subtract(*(activations.sigmoid(c.opacity_logits.astype(np.float64)) for c in (reference, candidate))))
     errors = {
         "means": means,
         "scales": scales,
@@ -115,18 +111,23 @@ def attribute_errors(reference: GaussianCloud, candidate: GaussianCloud) -> dict
 
 
 def _covariance_errors(reference: GaussianCloud, candidate: GaussianCloud) -> NDArray[np.float64]:
-    """Return ||Sigma' - Sigma|| / ||Sigma||, both scaled by the reference's longest axis so that nothing overflows."""
-    longest = reference.log_scales.max(axis=1, initial=-np.inf, keepdims=True).astype(np.float64)
-    longest = np.where(np.isfinite(longest), longest, 0.0)
+    """Return ||Sigma' - Sigma|| / ||Sigma||, each in units of a longest axis so that nothing overflows; inf beyond float64."""
+    own, others = (
+        cloud.log_scales.max(axis=1, initial=-np.inf, keepdims=True).astype(np.float64) for cloud in (reference, candidate)
+    )
+    own = np.where(np.isfinite(own), own, 0.0)
+    unit = np.maximum(own, others)
 
-    def covariances(cloud: GaussianCloud) -> NDArray[np.float64]:
-        axes = quaternions.to_matrix(cloud.quats.astype(np.float64)) * np.exp(cloud.log_scales - longest)[:, None, :]
+    def covariances(cloud: GaussianCloud, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        axes = quaternions.to_matrix(cloud.quats.astype(np.float64)) * np.exp(cloud.log_scales - unit)[:, None, :]
         return np.asarray(axes @ axes.transpose(0, 2, 1))
 
-    first = covariances(reference)
-    difference = np.linalg.norm(covariances(candidate) - first, axis=(1, 2))
-    norms = np.linalg.norm(first, axis=(1, 2))
-    return np.asarray(np.divide(difference, norms, out=np.where(difference > 0, np.inf, 0.0), where=norms > 0))
+    difference = np.linalg.norm(covariances(candidate, unit) - covariances(reference, unit), axis=(1, 2))
+    norms = np.linalg.norm(covariances(reference, own), axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        relative = difference / np.where(norms > 0, norms, 1.0) * np.exp(2 * (unit - own)[:, 0])
+    # No extent at all became some: nothing to be relative to. No difference times infinity is none.
+    return np.where(difference == 0, 0.0, np.where(norms > 0, relative, np.inf))
 
 
 class AttributeTally:
@@ -141,8 +142,7 @@ class AttributeTally:
         for name, errors in attribute_errors(reference, candidate).items():
             statistics = self.attributes.setdefault(name, AttributeStatistics())
             if name in bounds:
-                bound = np.broadcast_to(np.asarray(bounds[name], np.float64), errors.shape)
-                statistics.add(errors, bound, _slack(name, reference, bound))
+                statistics.add(errors, np.broadcast_to(np.asarray(bounds[name], np.float64), errors.shape))
             else:
                 statistics.add(errors, None)
 
@@ -158,20 +158,6 @@ class AttributeTally:
     def to_json(self) -> dict[str, dict[str, float | int | None]]:
         """Return every attribute's errors."""
         return {name: tally.to_json() for name, tally in self.attributes.items()}
-
-
-def _slack(name: str, reference: GaussianCloud, bound: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what float32 arithmetic in a decoder may add to a bound."""
-    sizes: NDArray[np.floating[Any]] = np.ones(1)
-    if name == "means":
-        sizes = np.abs(reference.means) + np.abs(reference.origin)
-    elif name in {"sh0", "shN"} and getattr(reference, name).shape == bound.shape:
-        sizes = np.abs(getattr(reference, name))
-    elif name == "scales":
-        sizes = 2 * np.abs(np.nan_to_num(np.sort(reference.log_scales, axis=1), neginf=0.0))
-    elif name == "covariances":
-        sizes = 16 * (1 + np.abs(np.nan_to_num(reference.log_scales.max(axis=1, initial=-np.inf), neginf=0.0)))
-    return np.asarray(bound * 1e-5 + _FLOAT32_SLACK * sizes, np.float64)
 
 
 def paired(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.codecs.rotation_bounds import relative_covariance_bound
+from gsplat_tools.codecs.rotation_bounds import covariance_bound_of_ranges
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.pack.encoding import FLAT_LN_SCALE, SplatEncoding
@@ -28,6 +28,9 @@ For half angles h, h' and axes at angle g the product of the quaternions is cos(
 _FLOAT32_ANGLE = 2.0**-21
 """Largest rotation error of a unit quaternion whose components are rounded to float32: 2 asin(2^-24), and slack."""
 
+_LARGEST_LN_SCALE = float(np.log(float(np.finfo(np.float32).max)))
+_FLAT_LN_FLOAT32, _SMALLEST_LN_FLOAT32 = (float(exponent * np.log(2.0)) for exponent in (-150, -149))
+
 _ROUNDING = 2.0**-22
 """Decoded values are rounded to float32 and were computed from float32: relative to the value."""
 
@@ -37,8 +40,8 @@ def spark_bounds(source: GaussianCloud, encoding: SplatEncoding) -> Bounds:
     colors = source.sh0.astype(np.float64) * SH_C0 + 0.5
     color_step = (encoding.rgb_max - encoding.rgb_min) / 255
     log_scales = source.log_scales.astype(np.float64)
-    scale_errors = _scale_errors(log_scales, encoding)
-    covariances = relative_covariance_bound(log_scales, scale_errors, SPARK_ANGLE)
+    stored, reach = _stored_scales(log_scales, encoding)
+    covariances = covariance_bound_of_ranges(log_scales, stored - reach, stored + reach, SPARK_ANGLE)
     sorted_scales = np.sort(log_scales, axis=1)
     limits: Bounds = {
         "means": half_step(source.means),
@@ -60,12 +63,18 @@ def spark_bounds(source: GaussianCloud, encoding: SplatEncoding) -> Bounds:
     return limits | _exact_motion(source)
 
 
+def _stored_scales(log_scales: Float64, encoding: SplatEncoding) -> tuple[Float64, float]:
+    """Return log scales clamped to their range, flat ones -inf, and how far rounding moves those."""
+    slack = _ROUNDING * max(1.0, abs(encoding.ln_scale_min), abs(encoding.ln_scale_max))
+    clamped = np.clip(log_scales, encoding.ln_scale_min, encoding.ln_scale_max)
+    return np.where(log_scales < FLAT_LN_SCALE, -np.inf, clamped), 0.5 * encoding.ln_scale_step + slack
+
+
 def _scale_errors(log_scales: Float64, encoding: SplatEncoding) -> Float64:
     """Return how far log scales may move; inf where a finite one becomes flat."""
-    step = encoding.ln_scale_step
-    slack = _ROUNDING * max(1.0, abs(encoding.ln_scale_min), abs(encoding.ln_scale_max))
-    errors = 0.5 * step + slack + _outside(log_scales, encoding.ln_scale_min, encoding.ln_scale_max)
-    return np.where(np.isneginf(log_scales), 0.0, np.where(log_scales < FLAT_LN_SCALE, np.inf, errors))
+    stored, reach = _stored_scales(log_scales, encoding)
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isneginf(log_scales), 0.0, np.abs(log_scales - stored) + reach)
 
 
 def _outside(values: Float64, low: float, high: float) -> Float64:
@@ -82,28 +91,38 @@ def half_step(values: NDArray[np.float32]) -> Float64:
 def uncompressed_bounds(source: GaussianCloud) -> Bounds:
     """Return the largest errors of the uncompressed layout for the splats of `source`."""
     log_scales = source.log_scales.astype(np.float64)
-    errors = _float32_scale_errors(log_scales)
+    sorted_scales = np.sort(log_scales, axis=1)
+    low, high = _float32_scales(sorted_scales)
+    is_flat = np.isneginf(sorted_scales)
+    with np.errstate(invalid="ignore"):
+        moves = np.maximum(high - sorted_scales, sorted_scales - low)
     limits: Bounds = {
         "means": np.zeros((1, 3)),
-        "scales": _float32_scale_errors(np.sort(log_scales, axis=1)),
-        "covariances": relative_covariance_bound(log_scales, errors, _FLOAT32_ANGLE) + _ROUNDING,
+        "scales": np.where(is_flat, 0.0, moves),
+        "covariances": covariance_bound_of_ranges(log_scales, *_float32_scales(log_scales), _FLOAT32_ANGLE) + _ROUNDING,
         "opacities": np.array([2.0**-24]),  # half a step below 1, and the slope of the logit's rounding, 0.23 steps
         "sh0": np.zeros((1, 3)),
     }
     return limits | ({"shN": np.zeros((1, 1, 3))} if source.sh_degree else {}) | _exact_motion(source)
 
 
-def _float32_scale_errors(log_scales: Float64) -> Float64:
-    """Return how far log scales may move when exp, and then log, are rounded to float32."""
-    with np.errstate(over="ignore", under="ignore"):
-        scales = np.exp(log_scales)
-        narrow = scales.astype(np.float32)
-    # Half a step relative to the value; subnormals have fewer bits. The logarithm doubles it near the smallest.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = 0.5 * np.maximum(2.0**-149, scales * 2.0**-23) / scales
-        errors = -np.log1p(-np.minimum(relative, 0.5)) + np.abs(log_scales) * 2.0**-24 + 2.0**-40
-    errors = errors + np.maximum(log_scales - np.log(float(np.finfo(np.float32).max)), 0.0)
-    return np.where(np.isneginf(log_scales), 0.0, np.where(narrow == 0, np.inf, errors))
+def _float32_scales(log_scales: Float64) -> tuple[Float64, Float64]:
+    """Return between what log scales come back when exp, clamped at the largest number, and then log are rounded to float32.
+
+    Below half of the smallest number a scale is flat: -inf.
+    """
+    stored = np.minimum(log_scales, _LARGEST_LN_SCALE)
+    with np.errstate(under="ignore", divide="ignore", invalid="ignore"):
+        scales = np.exp(stored)
+        # Half a step relative to the value; subnormals have fewer bits.
+        half_step = np.minimum(0.5 * np.maximum(2.0**-149, scales * 2.0**-23) / scales, 1.0)
+        slack = np.where(np.isfinite(stored), np.abs(stored), 0.0) * 2.0**-24 + 2.0**-40
+        low, high = stored + np.log1p(-half_step) - slack, stored + np.log1p(half_step) + slack
+    # What is not flat is at least the smallest number; within float64's rounding of half of it a scale may go either way.
+    low = np.maximum(low, _SMALLEST_LN_FLOAT32 - slack)
+    low = np.where(stored <= _FLAT_LN_FLOAT32 + 1e-9, -np.inf, low)
+    high = np.where(stored < _FLAT_LN_FLOAT32 - 1e-9, -np.inf, high)
+    return low, high
 
 
 def _exact_motion(source: GaussianCloud) -> Bounds:

@@ -22,6 +22,7 @@ from typing import BinaryIO
 import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.formats._motion_repair import MotionRepair
 from gsplat_tools.formats._ply_comments import splat_comments
 from gsplat_tools.formats._ply_header import read_header
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, NoOptions
@@ -81,7 +82,10 @@ def inspect(stream: BinaryIO) -> FileInfo:
 
 
 def bounds(source: GaussianCloud, _stream: BinaryIO, _frame: int) -> Bounds:
-    """Return zero for every attribute: each float32 comes back with the same bits."""
+    """Return zero for every attribute, since each float32 comes back with the same bits, but for times out of range.
+
+    Those are brought into the range of their time model when the file is read.
+    """
     limits: Bounds = {
         "means": np.zeros((1, 3)),
         "scales": np.zeros((1, 3)),
@@ -91,7 +95,9 @@ def bounds(source: GaussianCloud, _stream: BinaryIO, _frame: int) -> Bounds:
         "shN": np.zeros((1, 1, 3)),
     }
     if source.has_motion:
-        limits |= {"velocities": np.zeros((1, 3)), "times": np.zeros(1), "durations": np.zeros(1)}
+        repaired = MotionRepair(source.time_model, len(source)).apply(source)
+        limits["velocities"] = np.zeros((1, 3))
+        limits |= {name: np.abs(getattr(source, name).astype(np.float64) - values) for name, values in repaired.items()}
     return limits
 
 

@@ -11,6 +11,9 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog.bundle import open_bundle
 
+_HALF_STEP, _SMALLEST = 2.0**-24 * (1 + 1e-6), 2.0**-150
+"""Rounding to float32: relative, with what float64 arithmetic adds, and half of the smallest subnormal."""
+
 
 def bounds(source: GaussianCloud, stream: BinaryIO) -> Bounds:
     """Return the largest errors of a bundle.
@@ -26,8 +29,9 @@ def bounds(source: GaussianCloud, stream: BinaryIO) -> Bounds:
     -------
     Bounds
         means: half a step d of n = sign(x) ln(1 + |x|) is (1 + |x|) (exp(d / 2) - 1), because |n| may grow by d / 2 and no
-        other change of n moves x further · opacities: half of 1 / 255 · sh0 and scales: distance to the nearest entry of
-        the codebook, infinite for flat axes · covariances: those distances and the turn that the rotation codes allow.
+        other change of n moves x further, and the rounding of the result to float32 · opacities: half of 1 / 255 · sh0 and
+        scales: distance to the nearest entry of the codebook, infinite for flat axes · covariances: those distances and the
+        turn that the rotation codes allow.
         shN is measured only: it depends on the palette.
 
     Raises
@@ -41,13 +45,14 @@ def bounds(source: GaussianCloud, stream: BinaryIO) -> Bounds:
     bundle, _ = open_bundle(stream)
     assert bundle is not None
     meta = bundle.meta
-    half_step = (meta.means_high - meta.means_low) / 65535 / 2
+    sizes = np.abs(source.means.astype(np.float64))
+    moved = (1 + sizes) * np.expm1((meta.means_high - meta.means_low) / 65535 / 2)
     angle = quaternion_sog.max_angle(bundle.codes("quats"))
     covariances = relative_covariance_bound(source.log_scales, _distances(source.log_scales, meta.scales[0]), angle)
     # A splat without any extent gets one, so that no relative error is left.
     has_extent = np.isfinite(source.log_scales).any(axis=1)
     return {
-        "means": (1 + np.abs(source.means.astype(np.float64))) * np.expm1(half_step),
+        "means": moved + (sizes + moved) * _HALF_STEP + _SMALLEST,
         "opacities": np.full(len(source), 0.5 / 255 + 1e-6),  # the ends are read as 1e-6 and 1 - 1e-6
         "sh0": _distances(source.sh0, meta.sh0[0]),
         "scales": _distances(np.sort(source.log_scales, axis=1), meta.scales[0]),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from gsplat_tools.codecs.rotation_bounds import covariance_bound_of_ranges
 from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog4d.bundle import Bundle
 from gsplat_tools.formats.sog4d.meta import frame_path
-from gsplat_tools.formats.sog4d.textures import pixels_of
+from gsplat_tools.formats.sog4d.textures import indices_of, pixels_of
 
 _ROUNDING = 2.0**-22
 """Relative slack for float32 results: two units in the last place."""
@@ -38,8 +38,9 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
     -------
     Bounds
         means: half of range / 65535 an axis · opacities: half of 1 / 255 · sh0: distance to the nearest entry of the
-        codebook · scales: what the distance to the nearest codebook entry allows, infinite for an axis that is too thin
-        to show · covariances: what these scales and the rounding of the rotation's bytes allow. shN is measured only.
+        codebook · scales: distance to the nearest entry of theirs, or what a label kept from the frame before allows,
+        infinite for an axis that is too thin to show · covariances: what these scales and the rounding of the rotation's
+        bytes allow. shN is measured only.
 
     Raises
     ------
@@ -54,9 +55,12 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
     means = (high - low) / 65535 / 2 + np.maximum(np.abs(low), np.abs(high)) * _ROUNDING
     entries = meta.sh0_codebook[nearest_entry(source.sh0, meta.sh0_codebook)]
     sh0 = np.abs(entries - source.sh0.astype(np.float64)) + np.abs(source.sh0) * _ROUNDING + np.float32(1e-30)
-    least, largest = scale_reach(source.log_scales, meta.scale_codebook, is_first=frame == 0)
-    logs = source.log_scales.astype(np.float64)
     codes = pixels_of(bundle.image(frame_path(meta.rotation_path, frame), frame), len(source))
+    indices = indices_of(bundle.image(frame_path(meta.scale_indices_path, frame), frame), len(source))
+    least, largest = scale_reach(
+        source.log_scales, meta.scale_codebook, indices, source_axes(source.quats, codes), is_first=frame == 0
+    )
+    logs = source.log_scales.astype(np.float64)
     return {
         "means": np.broadcast_to(means, source.means.shape),
         "opacities": np.full(len(source), 0.5 / 255 + _ROUNDING),
@@ -86,37 +90,71 @@ def rotation_bound(codes: NDArray[np.uint8]) -> float:
     return float(2 * np.arcsin(min(1.0, 1.1 / max(float(lengths.min(initial=127.0)), 1.1))))
 
 
+def source_axes(quats: NDArray[np.float32], codes: NDArray[np.uint8]) -> NDArray[np.intp]:
+    """Return which axis of the source each stored axis is, (N, 3), from the rotations of both.
+
+    Encoders relabel the axes of a splat, which turns its rotation by 90 degrees about some of them; rounding turns it by a
+    few degrees at most, so that the largest entry of each column tells.
+    """
+    from gsplat_tools.attributes.quaternions import to_matrix
+    from gsplat_tools.codecs import quaternion_u8
+
+    stored = to_matrix(quaternion_u8.decode(codes).astype(np.float64))
+    return np.argmax(np.abs(to_matrix(quats.astype(np.float64)).transpose(0, 2, 1) @ stored), axis=1)
+
+
 def scale_reach(
-    log_scales: NDArray[np.float32], codebook: NDArray[np.float32], *, is_first: bool = True
+    log_scales: NDArray[np.float32],
+    codebook: NDArray[np.float32],
+    indices: NDArray[np.integer[Any]],
+    axes: NDArray[np.intp],
+    *,
+    is_first: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the least and the largest logarithm that each scale may be decoded as, (N, 3) each, axes as in the source.
 
     Notes
     -----
-    Entries are chosen by `scale_coordinates` y = log(s + a m), m the largest scale. With every coordinate within d of the
-    source's, m lies within a factor e^d, and a scale between e^(y-d) - a m e^d and e^(y+d) - a m e^-d: nothing bounds its
-    logarithm from below once the first of these is not positive. Axes are named by the first frame: there they fall where
-    those of the codebook do, and are the source's else. Later frames may have another order, and labels kept from the
-    frame before at a price of at most the mean squared error, so that d is the largest over all six orders.
+    The entry is the one nearest in `scale_coordinates`, y = max(log(s + a m), floor) with m the largest scale; it is known
+    from the codebook. Later frames may keep the label of the frame before, at a price of at most the mean squared error:
+    such an entry lies within d of the source in every coordinate, so that m lies within a factor e^d, and a scale between
+    e^(y-d) - a m e^d and e^(y+d) - a m e^-d. Nothing bounds its logarithm from below once the first of these is not
+    positive, or the coordinate is at the floor, where all thinner scales are the same.
     """
     from gsplat_tools.codecs.palette import nearest_labels
-    from gsplat_tools.formats.sog4d.codebooks import THIN, scale_coordinates
+    from gsplat_tools.formats.sog4d.codebooks import MIN_LOG, THIN, scale_coordinates
 
     with np.errstate(divide="ignore"):
-        entries = scale_coordinates(np.log(codebook))
+        logs_of_entries = np.log(codebook.astype(np.float64))
+    entries = scale_coordinates(logs_of_entries.astype(np.float32))
+    points = scale_coordinates(np.take_along_axis(log_scales, axes, axis=1))
+    nearest, squares = nearest_labels(points, entries)
+    least = largest = logs_of_entries[nearest]
+    is_kept = np.zeros(len(points), np.bool_) if is_first else nearest != indices
+    if is_kept.any():
+        prices = np.square(points.astype(np.float64) - entries[indices]).sum(axis=1) - squares
+        allowed = min(float(prices[is_kept].max()), _price_of_keeping(log_scales, entries))
+        reach = np.sqrt(squares.astype(np.float64) + max(allowed, 0.0))[:, None] + 1e-6
+        low, high = points - reach, points + reach
+        longest = points.max(axis=1, keepdims=True) - np.log1p(THIN)
+        # A longest axis at the floor may be stored as any thinner one.
+        shortest = np.where(longest - reach > MIN_LOG, np.exp(longest - reach), 0.0)
+        with np.errstate(divide="ignore"):
+            lower = np.log(np.maximum(np.exp(low) - THIN * np.exp(longest + reach), 0.0))
+            upper = np.log(np.exp(high) - THIN * shortest)
+        lower[low <= MIN_LOG] = -np.inf
+        least = np.where(is_kept[:, None], lower, least)
+        largest = np.where(is_kept[:, None], upper, largest)
+    # From the axes of the file to those of the source.
+    back = np.argsort(axes, axis=1)
+    return np.take_along_axis(least, back, axis=1) - _LOG_SLACK, np.take_along_axis(largest, back, axis=1) + _LOG_SLACK
+
+
+def _price_of_keeping(log_scales: NDArray[np.float32], entries: NDArray[np.float32]) -> float:
+    """Return a squared distance that no kept label may add: the mean over the splats, axes in their worst order."""
+    from gsplat_tools.codecs.palette import nearest_labels
+    from gsplat_tools.formats.sog4d.codebooks import scale_coordinates
+
     points = scale_coordinates(log_scales)
-    if not is_first:
-        candidates = [points[:, order] for order in permutations(range(3))]
-    elif (np.diff(codebook, axis=1) <= 0).all():
-        candidates = [-np.sort(-points, axis=1)]
-    else:
-        candidates = [points]
-    squares = np.max([nearest_labels(np.ascontiguousarray(rows), entries)[1] for rows in candidates], axis=0).astype(np.float64)
-    kept = 0.0 if is_first else squares.mean()
-    reach = np.sqrt(squares + kept)[:, None] + 1e-6
-    scales = np.exp(log_scales.astype(np.float64))
-    added = THIN * scales.max(axis=1, keepdims=True)
-    upper = (scales + added) * np.exp(reach) - added * np.exp(-reach)
-    lower = (scales + added) * np.exp(-reach) - added * np.exp(reach)
-    with np.errstate(divide="ignore"):
-        return np.log(np.maximum(lower, 0.0)) - _LOG_SLACK, np.log(upper) + _LOG_SLACK
+    candidates = (np.ascontiguousarray(points[:, order]) for order in permutations(range(3)))
+    return float(np.max([nearest_labels(rows, entries)[1] for rows in candidates], axis=0).mean(dtype=np.float64))

@@ -26,7 +26,9 @@ THIN = 0.02
 LONG_SHARE = 0.02
 """Share of splats whose rotation is stored as exactly as four bytes allow, also where the rest is stored small."""
 
-_MIN_LOG = -27.0
+MIN_LOG = -27.0
+"""Floor of `scale_coordinates`: e^-27 world units, 2e-12, below which all scales are the same."""
+
 _MAX_LOG = 88.0
 _MAX_HALF = np.float32(65504)
 
@@ -111,9 +113,9 @@ def scale_coordinates(log_scales: Float32) -> Float32:
     An axis much thinner than the others does not change a splat's shape; without this a codebook spends its entries on
     telling 1e-6 from 1e-7.
     """
-    wide = np.clip(log_scales.astype(np.float64), _MIN_LOG - 10, _MAX_LOG)
+    wide = np.clip(log_scales.astype(np.float64), MIN_LOG - 10, _MAX_LOG)
     largest = wide.max(axis=-1, keepdims=True)
-    coordinates: Float32 = np.maximum(largest + np.log(np.exp(wide - largest) + THIN), _MIN_LOG).astype(np.float32)
+    coordinates: Float32 = np.maximum(largest + np.log(np.exp(wide - largest) + THIN), MIN_LOG).astype(np.float32)
     return coordinates
 
 

@@ -48,17 +48,18 @@ def bounds(source: GaussianCloud, _stream: BinaryIO, _frame: int) -> Bounds:
         what clamping adds, splat by splat; covariances from the rotation's largest error.
     """
     from gsplat_tools.codecs.quaternion_u8 import MAX_ANGLE
-    from gsplat_tools.codecs.rotation_bounds import relative_covariance_bound
+    from gsplat_tools.codecs.rotation_bounds import covariance_bound_of_ranges
 
     logs = source.log_scales.astype(np.float64)
-    clamped = np.where(np.isfinite(logs), np.abs(logs - np.clip(logs, *LOG_SCALE_RANGE)), 0.0)
-    errors = np.where(np.isfinite(logs), clamped + _SCALE_ROUNDING, 0.0)
+    is_finite = np.isfinite(logs)
+    kept = np.where(is_finite, np.clip(logs, *LOG_SCALE_RANGE), logs)
+    errors = np.where(is_finite, np.abs(np.nan_to_num(logs) - np.nan_to_num(kept)) + _SCALE_ROUNDING, 0.0)
     order = np.argsort(logs, axis=1)
     limits: Bounds = {
         "means": np.zeros((1, 3)),
         "scales": np.take_along_axis(errors, order, axis=1),
-        "covariances": relative_covariance_bound(logs, errors, MAX_ANGLE),
-        "opacities": np.full(1, 0.5 / 255),
+        "covariances": covariance_bound_of_ranges(logs, kept - _SCALE_ROUNDING, kept + _SCALE_ROUNDING, MAX_ANGLE),
+        "opacities": np.full(1, 0.5 / 255 + _SCALE_ROUNDING),
         "sh0": 0.5 / 255 / SH_C0 + np.maximum(np.abs(source.sh0.astype(np.float64)) - MAX_SH0, 0.0),
     }
     if source.times is not None and source.durations is not None:
