@@ -12,6 +12,8 @@
     ├── CapabilityError (ValueError)      the target cannot hold this cloud, or has no reader or writer
     ├── CloudError (ValueError)           arrays break a GaussianCloud invariant
     ├── TargetExistsError (FileExistsError)  the target is there and may not be overwritten
+    ├── ReadError (OSError)             the operating system could not read a source
+    ├── WriteError (OSError)            it could not write a target, or the bytes did not come back as they were written
     ├── ValidationError (ValueError)      what was written does not hold its bounds, or --min-psnr
     └── MissingDependencyError (ImportError)  optional package absent; says what to install
     GsplatWarning (UserWarning)
@@ -106,6 +108,18 @@ class TargetExistsError(GsplatError, FileExistsError):
     """The target is there and overwriting was not asked for."""
 
     # OSError's own __str__ would format errno and filename.
+    __str__ = GsplatError.__str__
+
+
+class ReadError(GsplatError, OSError):
+    """The operating system could not read a source."""
+
+    __str__ = GsplatError.__str__
+
+
+class WriteError(GsplatError, OSError):
+    """The operating system could not write a target, or did not keep what was written."""
+
     __str__ = GsplatError.__str__
 
 

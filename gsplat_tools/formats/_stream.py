@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import io
-import shutil
-import tempfile
 from typing import BinaryIO, cast
 
 from gsplat_tools.errors import LimitExceededError, TruncatedDataError
+from gsplat_tools.formats._files import spooled
 
 MAX_EXPANSION = 1024
 """A header that claims more than this many times its file's size is refused before anything is allocated."""
@@ -62,12 +61,7 @@ def stream_size(stream: BinaryIO) -> int:
 
 def seekable(stream: BinaryIO) -> BinaryIO:
     """Return the stream, or a temporary copy of what is left of it where it cannot seek (pipes)."""
-    if stream.seekable():
-        return stream
-    copy = tempfile.SpooledTemporaryFile(max_size=_SPOOL_BYTES)  # noqa: SIM115 - the caller owns it
-    shutil.copyfileobj(stream, copy)
-    copy.seek(0)
-    return cast("BinaryIO", copy)
+    return stream if stream.seekable() else spooled(stream, _SPOOL_BYTES)
 
 
 def check_claim(claimed: int, available: int, *, field: str, offset: int | None = None) -> None:

@@ -6,15 +6,14 @@ import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from shutil import copyfileobj
-from tempfile import TemporaryFile
-from typing import Any, BinaryIO, Literal, cast
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
 from gsplat_tools.errors import CloudError
+from gsplat_tools.formats._files import Spool
 from gsplat_tools.formats.pack.container import ALIGNMENT, DTYPES, HEADER, LAYOUTS, MAGIC, VERSION, StreamLayout
 from gsplat_tools.parallel import map_ordered
 
@@ -60,7 +59,7 @@ def write(
         The items do not hold `count` splats.
     """
     with ExitStack() as stack:
-        files = [cast("BinaryIO", stack.enter_context(TemporaryFile())) for _ in layouts]
+        files = [stack.enter_context(Spool()) for _ in layouts]
         lengths: list[list[int]] = [[] for _ in layouts]
         checksums: list[list[int]] = [[] for _ in layouts]
         pieces = ((index, data, codec, level) for index, data in _frames(layouts, rows, count))
@@ -90,8 +89,7 @@ def write(
         position = ALIGNMENT + len(text)
         for file, entry in zip(files, entries, strict=True):
             stream.write(bytes(entry["offset"] - position))
-            file.seek(0)
-            copyfileobj(file, stream, 1 << 20)
+            stream.writelines(file.parts())
             position = entry["offset"] + entry["stored_length"]
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.errors import CorruptDataError, GsplatWarning, TruncatedDataError
+from gsplat_tools.formats._files import read_at
 from gsplat_tools.formats._ply_header import PlyElement, PlyHeader, check_text_claim, element_offsets
 from gsplat_tools.formats._stream import read_into
 
@@ -67,7 +68,7 @@ class StreamRows:
         """Fill the buffer without moving the position that threads share."""
         done = 0
         while done < len(buffer):
-            count = os.preadv(file, [buffer[done:]], offset + done)
+            count = read_at(file, buffer[done:], offset + done)
             if count == 0:
                 raise TruncatedDataError(
                     "the file became shorter while it was read", field=self._element.name, offset=offset + done

@@ -5,12 +5,12 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterable
 from contextlib import ExitStack
-from tempfile import SpooledTemporaryFile
 from typing import BinaryIO
 
 import numpy as np
 
 from gsplat_tools.errors import CorruptDataError, TruncatedDataError
+from gsplat_tools.formats._files import Spool
 from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats.spz.header import (
     FIRST_ZSTD_VERSION,
@@ -188,7 +188,7 @@ def write(stream: BinaryIO, header: Header, extensions: bytes, rows: Iterable[Pa
     flags = header.flags | (HAS_EXTENSIONS if extensions else 0)
     fixed = LEGACY_HEADER.pack(MAGIC, header.version, header.num_splats, header.sh_degree, header.fractional_bits, flags, 0)
     with ExitStack() as stack:
-        files = {name: stack.enter_context(SpooledTemporaryFile(max_size=_SPOOL_BYTES)) for name in names}
+        files = {name: stack.enter_context(Spool(_SPOOL_BYTES)) for name in names}
         for row in rows:
             for name, file in files.items():
                 file.write(np.ascontiguousarray(row[name]).data)
@@ -196,8 +196,6 @@ def write(stream: BinaryIO, header: Header, extensions: bytes, rows: Iterable[Pa
         compressor = zlib.compressobj(level, zlib.DEFLATED, _GZIP, 9)
         stream.write(compressor.compress(fixed))
         for file in files.values():
-            file.seek(0)
-            while part := file.read(_READ_BYTES):
-                stream.write(compressor.compress(part))
+            stream.writelines(map(compressor.compress, file.parts(_READ_BYTES)))
         stream.write(compressor.compress(extensions))
         stream.write(compressor.flush())

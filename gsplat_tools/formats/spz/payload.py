@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.formats._files import reserve
 from gsplat_tools.formats.spz.header import Header
 
 Bytes = NDArray[np.uint8]
@@ -34,6 +35,6 @@ class _Room:
         if self._in_memory or rows * width == 0:
             return np.empty((rows, width), np.uint8)
         with TemporaryFile() as file:  # the mapping keeps it alive
-            file.truncate(rows * width)
+            reserve(file, rows * width)
             mapped: Any = np.memmap(file, np.uint8, "r+", shape=(rows, width))
             return np.asarray(mapped)

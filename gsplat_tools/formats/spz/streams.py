@@ -6,14 +6,13 @@ import struct
 import threading
 from collections.abc import Iterable
 from contextlib import ExitStack
-from shutil import copyfileobj
-from tempfile import TemporaryFile
 from typing import BinaryIO, cast
 
 import numpy as np
 import zstandard
 
 from gsplat_tools.errors import CorruptDataError, TruncatedDataError
+from gsplat_tools.formats._files import Spool
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.spz.header import (
     FIRST_ZSTD_VERSION,
@@ -169,7 +168,7 @@ def write(stream: BinaryIO, header: Header, extensions: bytes, rows: Iterable[Pa
     """
     names = {name: width for name, width in header.attributes().items() if header.num_splats * width}
     with ExitStack() as stack:
-        files = {name: cast("BinaryIO", stack.enter_context(TemporaryFile())) for name in names}
+        files = {name: stack.enter_context(Spool()) for name in names}
         compressors = {
             name: zstandard.ZstdCompressor(level=_level_of(name, level), write_checksum=True).compressobj(
                 size=header.num_splats * width
@@ -204,7 +203,6 @@ def write(stream: BinaryIO, header: Header, extensions: bytes, rows: Iterable[Pa
             )
         )
         stream.write(extensions)
-        stream.writelines(_ENTRY.pack(files[name].tell(), header.num_splats * width) for name, width in names.items())
+        stream.writelines(_ENTRY.pack(files[name].length, header.num_splats * width) for name, width in names.items())
         for file in files.values():
-            file.seek(0)
-            copyfileobj(file, stream, 1 << 20)
+            stream.writelines(file.parts())
