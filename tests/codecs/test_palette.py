@@ -38,12 +38,61 @@ def test_nearest_labels__of_equal_centroids_name_one_of_them() -> None:
     assert distances.tolist() == [0, 0]
 
 
-def test_penalties__make_an_entry_dearer() -> None:
-    points = np.float32([[0.4, 0, 0]])
-    centroids = np.float32([[0, 0, 0], [1, 0, 0]])
+@pytest.mark.parametrize("dimensions", [4, 8, 9, 24, 45, 72])
+@pytest.mark.parametrize("size", [1024, 1500])
+def test_nearest_labels__among_cells_that_are_left_out_are_the_nearest(dimensions: int, size: int) -> None:
+    points, middles = clusters(1500, dimensions, 40)
+    centroids = np.concatenate([clusters(size - 40, dimensions, 40)[0], middles]) + np.float32(0.5)
 
-    assert nearest_labels(points, centroids, np.float32([0, 0]))[0].tolist() == [0]
-    assert nearest_labels(points, centroids, np.float32([0.3, 0]))[0].tolist() == [1]
+    labels, distances = nearest_labels(points, centroids)
+
+    _, expected = nearest(points, centroids)
+    assert np.allclose(distances, expected, rtol=1e-4, atol=1e-6)
+    assert np.allclose(((points - centroids[labels]) ** 2).sum(axis=1), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_nearest_labels__are_the_nearest_where_nothing_can_be_left_out(rng: np.random.Generator) -> None:
+    points, centroids = (rng.normal(0, 1, (count, 45)).astype(np.float32) for count in (1100, 2100))
+
+    labels, distances = nearest_labels(points, centroids)
+
+    _, expected = nearest(points, centroids)
+    assert np.allclose(distances, expected, rtol=1e-4, atol=1e-5)
+    assert np.allclose(((points - centroids[labels]) ** 2).sum(axis=1), expected, rtol=1e-4)
+
+
+def test_probes__trade_error_for_time(rng: np.random.Generator) -> None:
+    spread = np.float32(0.8) ** np.arange(24, dtype=np.float32)
+    points, centroids = (rng.normal(0, 1, (count, 24)).astype(np.float32) * spread for count in (2000, 4096))
+
+    errors = [nearest_labels(points, centroids, probes=probes)[1] for probes in (1, 4, 16, 64, None)]
+
+    means = [float(error.mean()) for error in errors]
+    assert means == sorted(means, reverse=True)
+    assert means[2] < 1.1 * means[4]
+    assert np.array_equal(errors[3], errors[4])  # 64 cells are all of them
+    assert all((error >= errors[4]).all() for error in errors)
+
+
+def test_nearest_labels__of_equal_vectors_in_many_cells() -> None:
+    points = np.zeros((300, 9), np.float32)
+
+    labels, distances = nearest_labels(points, np.zeros((1200, 9), np.float32))
+
+    assert (distances == 0).all()
+    assert ((labels >= 0) & (labels < 1200)).all()
+
+
+@pytest.mark.parametrize("probes", [None, 2])
+def test_nearest_labels__have_the_same_bits_at_any_number_of_threads(rng: np.random.Generator, probes: int | None) -> None:
+    points, _ = clusters(9000, 24, 60)
+    centroids = points[rng.permutation(9000)[:2000]]
+    results = []
+    for jobs in (1, 2, 4):
+        with use_jobs(jobs):
+            results.append([array.tobytes() for array in nearest_labels(points, centroids, probes=probes)])
+
+    assert results[0] == results[1] == results[2]
 
 
 def test_far_from_the_origin__distances_keep_their_digits() -> None:
