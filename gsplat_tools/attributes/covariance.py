@@ -77,3 +77,33 @@ def to_triangles(matrices: NDArray[Floating]) -> NDArray[Floating]:
 def to_matrices(triangles: NDArray[Floating]) -> NDArray[Floating]:
     """Return (N, 3, 3) symmetric matrices of (N, 6) upper triangles xx, xy, xz, yy, yz, zz."""
     return triangles[..., _FULL]
+
+
+def decompose(triangles: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the rotations and sizes of covariances, from their eigenvectors.
+
+    Parameters
+    ----------
+    triangles
+        (N, 6) upper triangles xx, xy, xz, yy, yz, zz, world units squared.
+
+    Returns
+    -------
+    tuple
+        quats (N, 4) unit, wxyz · log_scales (N, 3), ascending. An eigenvalue of 0 or below, which rounding leaves of a
+        thin axis, is a flat one: -inf. Covariances that are not finite have log scales of NaN.
+
+    Notes
+    -----
+    Dropping what is negative does not move a matrix further from any covariance: covariances are a convex cone.
+    """
+    is_finite = np.isfinite(triangles).all(axis=1)
+    matrices = to_matrices(np.where(is_finite[:, None], triangles, 0.0).astype(np.float64))
+    # Subnormal and huge entries keep their digits: powers of two are exact.
+    exponents = np.frexp(np.abs(matrices).max(axis=(1, 2), initial=0.0))[1]
+    values, vectors = np.linalg.eigh(np.ldexp(matrices, -exponents[:, None, None]))
+    vectors[:, :, 0] *= np.sign(np.linalg.det(vectors))[:, None]  # a rotation, not a reflection
+    with np.errstate(divide="ignore"):
+        logs = 0.5 * (np.log(np.maximum(values, 0.0)) + exponents[:, None] * np.log(2.0))
+    logs[~is_finite] = np.nan
+    return quaternions.from_matrix(vectors).astype(np.float32), logs.astype(np.float32)

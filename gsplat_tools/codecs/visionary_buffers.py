@@ -21,6 +21,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.attributes.covariance import covariance_triangles
+
 Precision = Literal["f32", "f16"]
 ShLayout = Literal["interleaved", "channel-major"]
 Words = NDArray[np.uint32]
@@ -79,6 +81,30 @@ def half_covariance_losses(covariances: NDArray[Any]) -> CovarianceLosses:
         halved=int(np.count_nonzero(is_there & ((rounded <= least / 4) | (rounded >= least * 4)))),
         overflowed=int(np.count_nonzero(~is_finite)),
     )
+
+
+def count_lost_needles(quats: NDArray[Any], log_scales: NDArray[Any]) -> int:
+    """Count the splats whose smallest axis half precision loses: needles and discs that come back flat.
+
+    Parameters
+    ----------
+    quats, log_scales
+        (N, 4) wxyz and (N, 3) natural logs, -inf is flat. Covariances are rounded to float32 and then to halves, as
+        Visionary's loaders do.
+
+    Notes
+    -----
+    As `half_covariance_losses(...).vanished`, by the signs of the leading minors of the rounded matrix (Sylvester) in place
+    of its eigenvalues: halves have 11 bits, so that float64 holds the products.
+    """
+    xx, xy, xz, yy, yz, zz = to_halves(covariance_triangles(quats, log_scales)).astype(np.float64).T
+    with np.errstate(invalid="ignore", over="ignore"):
+        minor = xx * yy - xy * xy
+        determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+        is_flat = ~((xx > 0) & (minor > 0) & (determinant > 0)) & np.isfinite(xx + yy + zz)
+        logs = np.sort(np.asarray(log_scales, np.float64), axis=1)
+        is_there = 2 * (logs[:, 0] - logs[:, 2]) > np.log(_EIGENVALUE_NOISE)
+    return int(np.count_nonzero(is_flat & is_there))
 
 
 def encode_gaussians(
