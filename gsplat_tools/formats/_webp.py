@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.errors import CorruptDataError, MissingDependencyError, TruncatedDataError
+from gsplat_tools.remembering import remembered
 
 MAX_SIDE = 16383
 """Largest width and height of a WebP image (RFC 9649: 14 bits each)."""
@@ -36,6 +37,7 @@ class WebpHeader:
     is_animated: bool
 
 
+@remembered
 def encode_rgba(image: Image, effort: int = DEFAULT_EFFORT) -> bytes:
     """Return an image as lossless WebP that decodes to the same bytes, also where alpha is 0.
 

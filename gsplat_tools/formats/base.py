@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.formats._issues import Issue, Rule
+from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.sequence import GaussianSequence
 
 SNIFF_BYTES = 4096
@@ -144,6 +145,8 @@ class Format:
         Frozen dataclasses whose defaults are the balanced choice.
     presets
         Changes to the write options for "fast", "balanced" and "best".
+    knobs
+        Options that trade bytes for accuracy, each with its values from coarsest to finest.
     model
         Reference rendering model and variant that stands for what the format's users see.
     """
@@ -179,4 +182,5 @@ class Format:
     read_options: type = NoOptions
     write_options: type = NoOptions
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    knobs: Mapping[str, Knob] = field(default_factory=general_knobs)
     model: tuple[str, str | None] = ("inria", None)

@@ -28,6 +28,7 @@ from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning, TruncatedDataError
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, Scene
+from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.parallel import BLOCK_SIZE, blocks, run_blocks
 from gsplat_tools.sequence import GaussianSequence
 
@@ -258,6 +259,7 @@ FORMAT = Format(
     min_splats=1,
     streams=True,
     write_options=SplatOptions,
-    presets={"fast": {"rotation": "reference"}, "balanced": {}, "best": {}},
+    presets={"fast": {"rotation": "reference"}, "balanced": {}, "best": {}, "exact": {}},
+    knobs={**general_knobs(0), "rotation": Knob(values=("small", "best"), stream="rotations")},
     model=("spark", None),
 )

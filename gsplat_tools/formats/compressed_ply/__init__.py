@@ -26,6 +26,7 @@ from gsplat_tools.constants import SH_C0
 from gsplat_tools.formats.base import Bounds, FileInfo, Format
 from gsplat_tools.formats.compressed_ply.reading import BLOCK, open_packed, read, read_chunks
 from gsplat_tools.formats.compressed_ply.writing import CompressedPlyOptions, write
+from gsplat_tools.formats.knobs import Knob, general_knobs
 
 __all__ = ["FORMAT", "CompressedPlyOptions", "bounds", "inspect", "matches", "read", "read_chunks", "write"]
 
@@ -123,6 +124,7 @@ FORMAT = Format(
     order="morton",
     position_type="fixed",
     write_options=CompressedPlyOptions,
-    presets={"fast": {"rotation": "reference"}, "balanced": {}, "best": {}},
+    presets={"fast": {"rotation": "reference"}, "balanced": {}, "best": {}, "exact": {}},
+    knobs={**general_knobs(3), "rotation": Knob(values=("small", "best"), stream="rotations")},
     model=("inria", None),
 )

@@ -28,6 +28,7 @@ from gsplat_tools.constants import MAX_SH_DEGREE
 from gsplat_tools.errors import CapabilityError, CloudError, CorruptDataError, TruncatedDataError, UnsupportedVersionError
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, Scene
+from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.formats.pack import words
 from gsplat_tools.formats.pack.container import StreamLayout
 from gsplat_tools.formats.pack.description import BoxTally, Description
@@ -252,6 +253,7 @@ FORMAT = Format(
     required_coordinates=AXES,
     position_type="f16",
     write_options=GsccOptions,
-    presets={"fast": {"rotation": "reference"}, "balanced": {}, "best": {}},
+    presets={"fast": {"rotation": "reference"}, "balanced": {}, "best": {}, "exact": {}},
+    knobs={**general_knobs(4), "rotation": Knob(values=("small", "best"), stream="rotations")},
     model=("unity", None),
 )

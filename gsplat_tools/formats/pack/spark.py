@@ -13,6 +13,7 @@ from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats.base import Format, Scene
+from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.formats.pack import gspk, words
 from gsplat_tools.formats.pack.container_writing import Codec, Rows
 from gsplat_tools.formats.pack.encoding import SplatEncoding, fit_encoding
@@ -112,6 +113,14 @@ FORMAT = Format(
         "fast": {"rotation": "reference", "zstd_level": 1},
         "balanced": {},
         "best": {"spark_encoding": "fit", "zstd_level": 12},
+        "exact": {"spark_encoding": "fit", "zstd_level": 12},
+    },
+    knobs={
+        **general_knobs(4),
+        "rotation": Knob(values=("small", "best"), stream="rotations"),
+        "spark_encoding": Knob(values=("default", "fit"), stream="ranges"),
+        "zstd_level": Knob(values=(3, 12, 19), stream="container"),
+        "order": Knob(values=("none", "morton"), stream="container"),
     },
     model=("unity", None),
 )

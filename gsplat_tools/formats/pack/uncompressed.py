@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.formats.base import Format, Scene
+from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.formats.pack import arrays, gspk
 from gsplat_tools.formats.pack.arrays import UncompressedPack, decode, encode
 from gsplat_tools.formats.pack.container_writing import Codec, Rows
@@ -79,6 +80,11 @@ FORMAT = Format(
     stores_splat_model=True,
     streams=True,
     write_options=UncompressedOptions,
-    presets={"fast": {"zstd_level": 1}, "balanced": {}, "best": {"zstd_level": 12}},
+    presets={"fast": {"zstd_level": 1}, "balanced": {}, "best": {"zstd_level": 12}, "exact": {"zstd_level": 12}},
+    knobs={
+        **general_knobs(4),
+        "zstd_level": Knob(values=(3, 12, 19), stream="container"),
+        "order": Knob(values=("none", "morton"), stream="container"),
+    },
     model=("unity", None),
 )

@@ -21,7 +21,7 @@ from gsplat_tools.formats.sog.bundle import Bundle, open_bundle
 from gsplat_tools.formats.sog.decode import read
 from gsplat_tools.formats.sog.encode import write
 from gsplat_tools.formats.sog.folder import FOLDER
-from gsplat_tools.formats.sog.options import SogOptions, SogReadOptions
+from gsplat_tools.formats.sog.options import KNOBS, SogOptions, SogReadOptions
 from gsplat_tools.formats.sog.rules import RULES
 
 __all__ = ["FORMAT", "RULES", "SogOptions", "SogReadOptions", "inspect", "matches", "read", "write"]
@@ -122,6 +122,8 @@ FORMAT = Format(
         "fast": {"rotation": "small", "webp_effort": 1, "palette_rounds": 1},
         "balanced": {},
         "best": {"palette_rounds": 8, "webp_effort": 9},
+        "exact": {"sh_palette_size": 65536, "palette_rounds": 8, "webp_effort": 9},
     },
+    knobs=KNOBS,
     model=("spark", None),
 )

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._webp import DEFAULT_EFFORT
+from gsplat_tools.formats.knobs import SIZES, Knob, general_knobs
 from gsplat_tools.formats.sog.rules import MAX_PALETTE
 
 RotationMode = Literal["best", "small", "reference"]
@@ -59,6 +60,14 @@ class SogOptions:
         _check_range("sh_palette_size", self.sh_palette_size, 1, MAX_PALETTE)
         _check_range("palette_rounds", self.palette_rounds, 0, 100)
         _check_range("webp_effort", self.webp_effort, 0, 9)
+
+
+KNOBS: dict[str, Knob] = {
+    **general_knobs(3),
+    "sh_palette_size": Knob(values=SIZES, stream="sh", graded=True, needs={"sh_degree": (1, 2, 3)}),
+    "rotation": Knob(values=("small", "best"), stream="rotations"),
+    "webp_effort": Knob(values=(1, 3, 9), stream="container"),
+}
 
 
 def _check_range(name: str, value: int | None, low: int, high: int) -> None:

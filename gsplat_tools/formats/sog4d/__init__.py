@@ -23,7 +23,7 @@ from gsplat_tools.formats.base import Bounds, FileInfo, Format
 from gsplat_tools.formats.sog4d.bundle import Bundle, read_meta
 from gsplat_tools.formats.sog4d.decode import read
 from gsplat_tools.formats.sog4d.encode import write
-from gsplat_tools.formats.sog4d.options import Sog4dOptions, Sog4dReadOptions
+from gsplat_tools.formats.sog4d.options import KNOBS, Sog4dOptions, Sog4dReadOptions
 from gsplat_tools.formats.sog4d.rules import RULES
 
 __all__ = ["FORMAT", "RULES", "Sog4dOptions", "Sog4dReadOptions", "inspect", "matches", "planes", "read", "write"]
@@ -144,6 +144,17 @@ FORMAT = Format(
         "fast": {"webp_effort": 1, "palette_rounds": 1, "detail": 0.5},
         "balanced": {},
         "best": {"detail": 2.0, "rotation": "best", "sh0_entries": 256, "palette_rounds": 8, "webp_effort": 7},
+        "exact": {
+            "version": 2,
+            "detail": 4.0,
+            "rotation": "best",
+            "sh0_entries": 256,
+            "palette_rounds": 8,
+            "keep_tolerance": 0.0,
+            "centroids": "f32",
+            "webp_effort": 7,
+        },
     },
+    knobs=KNOBS,
     model=("unity", "fork-4d"),
 )

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._webp import DEFAULT_EFFORT, MAX_SIDE
+from gsplat_tools.formats.knobs import SIZES, Knob, general_knobs
 from gsplat_tools.formats.sog4d.rules import MAX_CODEBOOK, MAX_PALETTE
 
 LabelEncoding = Literal["auto", "full", "delta-v1"]
@@ -126,6 +127,24 @@ class Sog4dOptions:
             raise CapabilityError(f"detail must be 0.1 to 4, got {self.detail}")
         if not 0 <= self.keep_tolerance <= 1:
             raise CapabilityError(f"keep_tolerance must be 0 to 1, got {self.keep_tolerance}")
+
+
+KNOBS: dict[str, Knob] = {
+    **general_knobs(3),
+    "version": Knob(values=(1, 2), stream="sh", needs={"sh_degree": (2, 3)}),
+    "sh_palette_size": Knob(values=SIZES, stream="sh", graded=True, needs={"sh_degree": (1, 2, 3)}),
+    "scale_codebook_size": Knob(values=SIZES, stream="scales", graded=True),
+    "sh0_entries": Knob(values=(12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128, 160, 192, 224, 256), stream="colors", graded=True),
+    "rotation": Knob(values=("small", "best"), stream="rotations"),
+    "rotation_steps": Knob(
+        values=(16, 18, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 112, 127),
+        stream="rotations",
+        graded=True,
+        needs={"rotation": ("small",)},
+    ),
+    "keep_tolerance": Knob(values=(0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.0), stream="labels", sequences_only=True),
+    "webp_effort": Knob(values=(1, 3, 7), stream="container"),
+}
 
 
 def _check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:

@@ -17,7 +17,7 @@ from gsplat_tools.constants import SH_C0
 from gsplat_tools.formats.base import Bounds, Format
 from gsplat_tools.formats.splat4d.checking import RULES, check
 from gsplat_tools.formats.splat4d.container import MAGIC
-from gsplat_tools.formats.splat4d.options import Splat4dOptions, Splat4dReadOptions
+from gsplat_tools.formats.splat4d.options import KNOBS, Splat4dOptions, Splat4dReadOptions
 from gsplat_tools.formats.splat4d.reading import inspect, read
 from gsplat_tools.formats.splat4d.records import LOG_SCALE_RANGE, MAX_SH0
 from gsplat_tools.formats.splat4d.writing import write
@@ -95,6 +95,8 @@ FORMAT = Format(
         "fast": {"sh_palette_size": 1024},
         "balanced": {},
         "best": {"sh_palette_size": 32768, "centroids": "f32"},
+        "exact": {"sh_palette_size": 65535, "centroids": "f32"},
     },
+    knobs=KNOBS,
     model=("unity", "fork-4d"),
 )

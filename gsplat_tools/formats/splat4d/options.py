@@ -7,6 +7,7 @@ from typing import Literal
 
 from gsplat_tools.cloud import TimeModel
 from gsplat_tools.errors import CapabilityError
+from gsplat_tools.formats.knobs import SIZES, Knob, general_knobs
 
 MAX_PALETTE = 65535
 """Entries that a label of 16 bits can name, one fewer than there are codes, as in .sog4d."""
@@ -72,6 +73,14 @@ class Splat4dOptions:
         _check_range("sh_palette_size", self.sh_palette_size, 1, MAX_PALETTE)
         _check_range("frame_count", self.frame_count, 1, 1 << 20)
         _check_range("delta_segment_length", self.delta_segment_length, 0, 1 << 20)
+
+
+KNOBS: dict[str, Knob] = {
+    **general_knobs(3),
+    "sh_palette_size": Knob(values=SIZES, stream="sh", graded=True, needs={"sh_degree": (1, 2, 3)}),
+    "centroids": Knob(values=("f16", "f32"), stream="sh", needs={"sh_degree": (1, 2, 3)}),
+    "rotation": Knob(values=("small", "best"), stream="rotations"),
+}
 
 
 def _check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:

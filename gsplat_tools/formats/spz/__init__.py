@@ -24,6 +24,7 @@ from gsplat_tools.cloud import GaussianCloud, empty_cloud
 from gsplat_tools.codecs.smallest_three import Rotation
 from gsplat_tools.errors import CapabilityError, LossyConversionWarning
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, Scene
+from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.formats.spz import attributes, legacy, limits, streams
 from gsplat_tools.formats.spz.header import (
     ANTIALIASED,
@@ -280,6 +281,22 @@ FORMAT = Format(
             "fractional_bits": "finest",
             "order": "morton",
         },
+        "exact": {
+            "level": 19,
+            "rotation": "best",
+            "sh1_bits": 8,
+            "sh_rest_bits": 8,
+            "fractional_bits": "finest",
+        },
+    },
+    knobs={
+        **general_knobs(4),
+        "sh1_bits": Knob(values=tuple(range(1, 9)), stream="sh", graded=True, needs={"sh_degree": (1, 2, 3, 4)}),
+        "sh_rest_bits": Knob(values=tuple(range(1, 9)), stream="sh", graded=True, needs={"sh_degree": (2, 3, 4)}),
+        "fractional_bits": Knob(values=tuple(range(6, 24)), stream="positions", graded=True),
+        "rotation": Knob(values=("small", "best"), stream="rotations"),
+        "level": Knob(values=(3, 12, 19), stream="container"),
+        "order": Knob(values=("none", "morton"), stream="container"),
     },
     model=("spark", None),
 )
