@@ -1,24 +1,30 @@
-"""Targets appear whole or not at all: temporary file beside the target, fsync, rename."""
+"""Targets appear whole or not at all: temporary file beside the target, sync, read back, rename, sync the folder."""
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import io
 import os
 import re
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
-from gsplat_tools.errors import GsplatError, TargetExistsError
+from gsplat_tools.errors import GsplatError, TargetExistsError, WriteError
+from gsplat_tools.formats._companion import file_of, published, remove_beside, sweep_beside
+from gsplat_tools.formats._files import RecordedFile, reason
+
+if os.name == "posix":
+    import fcntl
 
 _SUFFIX = ".gsplat-tmp"
+_MAX_STEM_BYTES = 180
+"""Longer names are replaced by a digest in the names of temporary files, which may have 255 bytes."""
 
-
-class WriteError(GsplatError, OSError):
-    """The operating system refused to write the target."""
-
-    __str__ = GsplatError.__str__
+_BUFFER_BYTES = 1 << 20
 
 
 @contextmanager
@@ -42,55 +48,74 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     TargetExistsError
         The target is there and `overwrite` is false.
     WriteError
-        The folder is missing, the disk is full, or another refusal by the operating system.
+        The folder is missing, the disk is full, another refusal by the operating system, or the temporary file does
+        not read back as it was written.
     """
-    path = path.resolve()  # a link stays a link, and what it points to is replaced
-    if path.is_dir():
-        raise TargetExistsError("the target is a folder; name a file in it", path=path)
-    if path.exists() and not path.is_file():
-        raise WriteError("the target is not a regular file (a device or a pipe); write to a file", path=path)
-    if path.exists() and not overwrite:
-        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=path)
-    if not path.parent.is_dir():
-        raise WriteError("the folder of the target does not exist; make it first", path=path)
-    sweep_stale(path)
-    stream: BinaryIO | None = None
+    with _explained(path):
+        target = _find_target(path, overwrite=overwrite)
+        sweep_stale(target)
+        raw = _create_temporary(target)
+    temporary = Path(raw.name)
+    stream = io.BufferedRandom(raw, _BUFFER_BYTES)
     try:
-        stream = cast(
-            "BinaryIO",
-            tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed below, renamed or removed
-                mode="w+b", dir=path.parent, prefix=f".{path.name}.{os.getpid()}.", suffix=_SUFFIX, delete=False
-            ),
-        )
         yield stream
-        stream.flush()
-        os.fsync(stream.fileno())
-        stream.close()
-        _copy_mode(path, Path(stream.name))
-        if path.exists() and not overwrite:  # made by someone else meanwhile
-            raise TargetExistsError("the target appeared while it was being made", path=path)
-        Path(stream.name).replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        if isinstance(error, GsplatError):
-            raise
-        raise WriteError(f"cannot write: {error.strerror or error}", path=path) from error
+        with _explained(path):
+            stream.flush()
+            _copy_mode(target, raw)
+            os.fsync(raw.fileno())
+            _read_back(raw, path)
+            if os.name != "posix":
+                stream.close()  # an open file cannot be renamed there; elsewhere its lock keeps sweepers away
+            with published(temporary, target):
+                _publish(temporary, target, overwrite=overwrite)
+            stream.close()
+            _sync_folder(target.parent)
     finally:
-        if stream is not None:
-            with suppress(OSError):
-                stream.close()
-            with suppress(OSError):
-                Path(stream.name).unlink(missing_ok=True)
+        # What could not be written stays in the buffer; closing tries once more.
+        with suppress(OSError, ValueError):
+            stream.close()
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        remove_beside(temporary)
 
 
 def sweep_stale(path: Path) -> None:
-    """Remove temporaries of this target that a killed process left behind."""
-    pattern = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\..*{re.escape(_SUFFIX)}")
-    for entry in path.parent.iterdir():
-        match = pattern.fullmatch(entry.name)
-        if match and not _is_alive(int(match[1])):
-            with suppress(OSError):
-                entry.unlink()
+    """Remove temporaries of this target whose writers are gone; those of running ones are locked and stay."""
+    pattern = re.compile(rf"\.{re.escape(_stem(path))}\.(\d+)\.[0-9a-z_]+{re.escape(_SUFFIX)}")
+    with suppress(OSError):
+        for name in os.listdir(path.parent):  # noqa: PTH208 - names are all that is needed
+            owner = file_of(name)
+            match = pattern.fullmatch(owner)
+            if match and owner != name:
+                sweep_beside(path.parent / name, path.parent / owner, is_alive=_is_alive(int(match[1])))
+            elif match:
+                with suppress(OSError):
+                    _sweep(path.parent / name, int(match[1]))
+
+
+def _sweep(entry: Path, process: int) -> None:
+    """Remove a temporary file unless its writer is at work."""
+    if os.name != "posix":
+        entry.unlink()  # refused while the file is open
+        return
+    flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    handle = os.open(entry, flags)
+    try:
+        if _is_abandoned(handle, process):
+            entry.unlink()  # the lock is still held: who made the file meanwhile sees that it is gone
+    finally:
+        os.close(handle)
+
+
+def _is_abandoned(handle: int, process: int) -> bool:
+    """Whether nobody holds the lock of a temporary file; where there are no locks, whether its process is gone."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return not _is_alive(process)
+    return True
 
 
 def _is_alive(process: int) -> bool:
@@ -104,22 +129,104 @@ def _is_alive(process: int) -> bool:
     return True
 
 
-def _copy_mode(path: Path, temporary: Path) -> None:
-    """Give the new file the permissions of the old one, or those that a plain open() would have given."""
-    if path.exists():
-        mode = path.stat().st_mode & 0o7777
-    else:
-        umask = os.umask(0)
-        os.umask(umask)
-        mode = 0o666 & ~umask
-    temporary.chmod(mode)
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn refusals by the operating system into errors that name the target."""
+    try:
+        yield
+    except GsplatError:
+        raise
+    except OSError as error:
+        raise WriteError(f"cannot write: {reason(error)}", path=path) from error
+
+
+def _find_target(path: Path, *, overwrite: bool) -> Path:
+    """Return the file to replace: a link stays a link, and what it points to is replaced."""
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise WriteError("the target is a link that leads to itself; remove it", path=path)
+    if target.is_dir():
+        raise TargetExistsError("the target is a folder; name a file in it", path=path)
+    if target.exists():
+        if not target.is_file():
+            raise WriteError("the target is not a regular file (a device or a pipe); write to a file", path=path)
+        if not overwrite:
+            raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=path)
+        if not os.access(target, os.W_OK):
+            raise WriteError("the target is write-protected; change its permissions or write elsewhere", path=path)
+    if not target.parent.is_dir():
+        raise WriteError("the folder of the target does not exist; make it first", path=path)
+    return target
+
+
+def _stem(path: Path) -> str:
+    """Return what names of temporaries of a target have in common."""
+    encoded = os.fsencode(path.name)
+    return path.name if len(encoded) <= _MAX_STEM_BYTES else hashlib.sha256(encoded).hexdigest()
+
+
+def _create_temporary(target: Path) -> RecordedFile:
+    """Make a temporary file beside the target, locked as long as it is open."""
+    # Never more open than the target; a new one gets what any new file gets.
+    mode = 0o600 if target.exists() else 0o666
+    while True:
+        name = f".{_stem(target)}.{os.getpid()}.{secrets.token_hex(4)}{_SUFFIX}"
+        try:
+            raw = RecordedFile(target.parent / name, mode, target)
+        except FileExistsError:
+            continue
+        if os.name != "posix":
+            return raw
+        with suppress(OSError):  # not every file system has locks
+            fcntl.flock(raw.fileno(), fcntl.LOCK_EX)
+        if os.fstat(raw.fileno()).st_nlink:
+            return raw
+        raw.close()  # someone swept it between the two calls
+
+
+def _copy_mode(target: Path, raw: RecordedFile) -> None:
+    """Give the new file the permissions of the old one."""
+    with suppress(FileNotFoundError):
+        Path(raw.name).chmod(target.stat().st_mode & 0o7777)
+
+
+def _read_back(raw: RecordedFile, path: Path) -> None:
+    """Refuse a file that does not hold what was written to it."""
+    offset = raw.first_difference()
+    if offset is not None:
+        raise WriteError(
+            "what was written does not read back the same: the disk, or the connection to it, is failing, or another program "
+            "changed the file; the target is left as it was",
+            path=path,
+            offset=offset,
+        )
+
+
+def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
+    """Give the temporary file its name."""
+    if overwrite:
+        os.replace(temporary, target)  # noqa: PTH105 - beside os.link and os.fsync
+        return
+    try:
+        os.link(temporary, target)  # unlike a rename, it never replaces a file that was made meanwhile
+    except OSError as error:
+        if isinstance(error, FileExistsError) or target.exists():
+            raise TargetExistsError("the target appeared while it was being made; it is left as it is", path=target) from error
+        os.replace(temporary, target)  # noqa: PTH105 - a file system without links
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the rename durable where folders can be synced."""
-    with suppress(OSError):
+    """Make the new name survive a power cut, where folders can be synced."""
+    try:
         handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+    except OSError:
+        return  # unreadable, or a system that opens no folders
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno in (errno.EIO, errno.ENOSPC, errno.EDQUOT):
+            raise WriteError(
+                f"the file is written, but its name may not survive a power cut: {reason(error)}", path=folder
+            ) from error
+    finally:
+        os.close(handle)
