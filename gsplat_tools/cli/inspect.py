@@ -11,6 +11,7 @@ import click
 from gsplat_tools.cli import _options as options
 from gsplat_tools.cli import _output as output
 from gsplat_tools.cli._errors import EXIT_DATA, one_line, reports_errors
+from gsplat_tools.cli._numerics import numerics
 from gsplat_tools.cli._tradeoff import tradeoff
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
@@ -280,6 +281,7 @@ def normalize(file: Path, *, target: Path | None, overwrite: bool) -> None:
         click.echo(change, err=True)
 
 
+main.add_command(numerics)
 main.add_command(tradeoff)
 
 

@@ -16,6 +16,7 @@ SPLATS = 96
 """Splats of a synthetic cloud: enough for stable maxima, few enough that every sweep ends within a minute."""
 
 _SEED = 20260601
+_LARGEST_PLOTTED = 110.0
 _LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
@@ -94,14 +95,41 @@ def _positions() -> Iterator[Condition]:
         )
 
 
+def _plotted(exponent: float) -> float | None:
+    """Return a natural logarithm as a place in plots; what float32 cannot hold after exp is a case, not a magnitude."""
+    return exponent if abs(exponent) <= _LARGEST_PLOTTED else None
+
+
 def _scales() -> Iterator[Condition]:
     """Log scales over all that float32 holds, flat axes, and needles."""
-    logs = (-3e38, -1e4, -150, -104, -100, -95, -88, -80, -60, -40, -20, -15, -12.5, -11, -10, -9, -7, -5, -3, -1, 0)
+    logs: tuple[float, ...] = (
+        -3e38,
+        -1e4,
+        -150,
+        -104,
+        -100,
+        -95,
+        -88,
+        -80,
+        -60,
+        -40,
+        -20,
+        -15,
+        -12.5,
+        -11,
+        -10,
+        -9,
+        -7,
+        -5,
+        -3,
+        -1,
+        0,
+    )
     logs += (1, 3, 5, 6, 8, 9.5, 12, 20, 30, 44, 60, 80, 88, 88.7, 89, 100, 1000, 3e38)
     wiggle = np.random.default_rng(_SEED + 3).uniform(-0.3, 0.3, (SPLATS, 3))
     for value in logs:
         values = np.clip(value + wiggle, -_LARGEST_FLOAT, _LARGEST_FLOAT)
-        yield Condition("log scale", f"{value:g}", value, ("scales", "covariances"), ordinary(log_scales=values))
+        yield Condition("log scale", f"{value:g}", _plotted(value), ("scales", "covariances"), ordinary(log_scales=values))
     flat = ordinary().log_scales.copy()
     flat[:, 2] = -np.inf
     flat[::4, 1] = -np.inf
@@ -157,7 +185,7 @@ def _opacities() -> Iterator[Condition]:
         for sign in (1, -1) if value else (1,):
             x = sign * value
             logits = np.clip(x + wiggle, -_LARGEST_FLOAT, _LARGEST_FLOAT)
-            yield Condition("opacity logit", f"{x:g}", x, ("opacities",), ordinary(opacity_logits=logits))
+            yield Condition("opacity logit", f"{x:g}", _plotted(x), ("opacities",), ordinary(opacity_logits=logits))
     for label, value in (("-inf", -np.inf), ("+inf", np.inf)):
         yield Condition("opacity logit", label, None, ("opacities",), ordinary(opacity_logits=np.full(SPLATS, value)))
     ends = np.where(np.arange(SPLATS) % 2 == 0, -np.inf, np.inf)

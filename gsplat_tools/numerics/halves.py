@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gsplat_tools.attributes.covariance import covariance_triangles, to_matrices
@@ -32,7 +34,13 @@ def half_row(cloud: GaussianCloud, sweep: str, label: str, x: float | None = Non
     """
     sizes = cloud.log_scales.max(axis=1, initial=-np.inf)
     cloud = cloud.take(np.isfinite(cloud.log_scales).all(axis=1) & (sizes < _LARGEST_LOG_SCALE))
-    facts = {"format": FORMAT, "attribute": ATTRIBUTE, "condition": f"{sweep} {label}".strip(), "sweep": sweep, "x": x}
+    facts: dict[str, Any] = {
+        "format": FORMAT,
+        "attribute": ATTRIBUTE,
+        "condition": f"{sweep} {label}".strip(),
+        "sweep": sweep,
+        "x": x,
+    }
     if len(cloud) == 0:
         return Row(**facts, note="no splats to judge")
     covariances = covariance_triangles(cloud.quats, cloud.log_scales, dtype=np.float64)

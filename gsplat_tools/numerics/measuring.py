@@ -109,7 +109,13 @@ def transfer(scene: Scene, record: Format) -> Transfer:
 
 
 def measure_cloud(
-    cloud: GaussianCloud, record: Format, *, watched: Iterable[str] | None = None, sweep: str = "scene", label: str = "", x: Any = None
+    cloud: GaussianCloud,
+    record: Format,
+    *,
+    watched: Iterable[str] | None = None,
+    sweep: str = "scene",
+    label: str = "",
+    x: Any = None,
 ) -> list[Row]:
     """Return the errors of one cloud in one format.
 
@@ -173,9 +179,7 @@ def compare_clouds(
     return errors, limits
 
 
-def _paths(
-    prepared: GaussianCloud, decoded: GaussianCloud, limits: Bounds
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _paths(prepared: GaussianCloud, decoded: GaussianCloud, limits: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how far mean + velocity (t - time) is off at any of some moments, and what the parts' bounds allow."""
 
     def parts(cloud: GaussianCloud) -> tuple[NDArray[np.float64], ...]:
@@ -187,7 +191,9 @@ def _paths(
     off, allowed = np.zeros(means.shape), np.zeros(means.shape)
     for t in _MOMENTS:
         # Differences of the parts, so that nothing large cancels.
-        difference = (means_read - means) + (velocities_read - velocities) * (t - times_read) - velocities * (times_read - times)
+        difference = (
+            (means_read - means) + (velocities_read - velocities) * (t - times_read) - velocities * (times_read - times)
+        )
         off = np.maximum(off, np.abs(difference))
         late = np.reshape(limits.get("times", np.zeros(1)), (-1, 1))
         speed = limits.get("velocities", np.zeros((1, 3)))

@@ -98,4 +98,6 @@ def _clamped(source: GaussianSequence, decoded: GaussianSequence, limits: Bounds
     count = len(source)
     off = [np.abs(source.frame(last % count).means - decoded.at(t).means.astype(np.float64)) for t, last in ends]
     per_frame = np.asarray(limits["means"]).reshape(count, -1, 3)
-    return judge("means out of range", np.concatenate(off), np.concatenate([per_frame[last % count] for _, last in ends]), **facts)
+    return judge(
+        "means out of range", np.concatenate(off), np.concatenate([per_frame[last % count] for _, last in ends]), **facts
+    )

@@ -100,7 +100,8 @@ def source_axes(quats: NDArray[np.float32], codes: NDArray[np.uint8]) -> NDArray
     from gsplat_tools.codecs import quaternion_u8
 
     stored = to_matrix(quaternion_u8.decode(codes).astype(np.float64))
-    return np.argmax(np.abs(to_matrix(quats.astype(np.float64)).transpose(0, 2, 1) @ stored), axis=1)
+    between: NDArray[np.float64] = to_matrix(quats.astype(np.float64)).transpose(0, 2, 1) @ stored
+    return np.asarray(np.argmax(np.abs(between), axis=1), np.intp)
 
 
 def scale_reach(
