@@ -36,6 +36,8 @@ _OPACITY_CULL = 0.02
 _TINY = 1e-6
 _LEAST_LAMBDA2 = 0.1
 _TINY_DETERMINANT = 1e-12
+# Spans come from other arithmetic than the test of a pixel; this keeps them on the safe side.
+_SLACK = 1e-4
 
 
 @device()
@@ -204,3 +206,62 @@ def preprocess(splats, uniforms, values, differences, states):
             for c in range(3):
                 values[i, VAL_COLOR + c] = one - ndc_z if mode == MODE_DEPTH else max(zero, splats[i, R.COLOR + c])
         differences[i] = uniforms[Z_FAR] - clip_z
+
+
+@kernel()
+def place(values, cutoff, width, height, records, bounds, states):
+    """Turn the values of records into splats of a picture, as blending reads them; what shows nothing gets a state only.
+
+    values   float (M, VALUES_SIZE)   read
+    cutoff   float                    nothing is drawn beyond this q
+    width    float                    px
+    height   float                    px
+    records  float (M, RECORD_SIZE)   written
+    bounds   int32 (M, 4)             written: x start, x stop, y start, y stop of the pixels that can be touched
+    states   uint8 (M,)               written: DRAWN, CULLED, or INVALID where the axes span no area
+    """
+    f = records.dtype.type
+    zero, one, half = f(0), f(1), f(0.5)
+    q = cutoff * (one + f(_SLACK)) + f(_SLACK)
+    for i in range(len(values)):
+        states[i] = R.CULLED
+        opacity = f(values[i, VAL_OPACITY])
+        if opacity == zero:
+            continue
+        # Rows of pixels go down, ndc goes up.
+        center_x = (f(values[i, VAL_POS]) + one) * half * width
+        center_y = (one - f(values[i, VAL_POS + 1])) * half * height
+        v1x, v1y = f(values[i, VAL_V1]) * width, -f(values[i, VAL_V1 + 1]) * height
+        v2x, v2y = f(values[i, VAL_V2]) * width, -f(values[i, VAL_V2 + 1]) * height
+        area = v1x * v2y - v2x * v1y
+        ux, uy, vx, vy = v2y / area, -v2x / area, -v1y / area, v1x / area
+        # q = (s dx + k dy)^2 + (h dy)^2: for a row of pixels, one square in dx.
+        s = np.sqrt(ux * ux + vx * vx)
+        k = (ux * uy + vx * vy) / s
+        h = abs(ux * vy - uy * vx) / s
+        reach_x = np.sqrt(q * (v1x * v1x + v2x * v2x))
+        reach_y = np.sqrt(q * (v1y * v1y + v2y * v2y))
+        total = s + k + h + center_x + center_y + reach_x + reach_y + opacity
+        for c in range(3):
+            total += f(values[i, VAL_COLOR + c])
+        if not (s > zero and h > zero and total * zero == zero):
+            states[i] = R.INVALID
+            continue
+        low_x, high_x = center_x - reach_x, center_x + reach_x
+        low_y, high_y = center_y - reach_y, center_y + reach_y
+        x_start = np.int32(min(max(low_x, zero), width))
+        y_start = np.int32(min(max(low_y, zero), height))
+        x_stop = np.int32(min(np.ceil(high_x), width)) if high_x > zero else np.int32(0)
+        y_stop = np.int32(min(np.ceil(high_y), height)) if high_y > zero else np.int32(0)
+        if x_start >= x_stop or y_start >= y_stop:
+            continue
+        states[i] = R.DRAWN
+        bounds[i, 0], bounds[i, 1], bounds[i, 2], bounds[i, 3] = x_start, x_stop, y_start, y_stop
+        records[i, R.REC_X], records[i, R.REC_Y] = center_x, center_y
+        records[i, R.REC_S], records[i, R.REC_K], records[i, R.REC_H] = s, k, h
+        records[i, R.REC_Q], records[i, R.REC_OPACITY] = q, opacity
+        for c in range(3):
+            records[i, R.REC_R + c] = f(values[i, VAL_COLOR + c])
+        records[i, R.REC_UX], records[i, R.REC_UY] = ux, uy
+        records[i, R.REC_VX], records[i, R.REC_VY] = vx, vy
+        records[i, R.REC_BOX] = one + one

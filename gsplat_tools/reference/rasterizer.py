@@ -16,6 +16,7 @@ from gsplat_tools.reference.cutouts import Cutout, find_survivors
 from gsplat_tools.reference.models import Model
 from gsplat_tools.reference.motion import Scene, SceneState, evaluate_scene
 from gsplat_tools.reference.sorting import checked_order
+from gsplat_tools.reference.visionary_drawing import project_state
 
 Precision = Literal["float32", "float64"]
 Framebuffer = Literal["float", "unorm8"]
@@ -168,12 +169,16 @@ def render(
         state = replace(state, is_visible=is_kept if state.is_visible is None else is_kept & state.is_visible)
     numbers = models.rule_array(rules, camera, dtype, scale_factor=scale_factor, brightness=brightness)
     choices = models.choice_array(rules, scale_factor=scale_factor, gamma_to_linear=gamma_to_linear, quantizes=quantizes)
-    projection = project_scene(state, camera, rules, numbers, choices, sh_degree)
     named = None if order is None else checked_order(order, len(state.cloud))
-    drawing = find_order(projection.states, state, camera, rules, named)
+    if rules.name == "visionary":
+        projection, drawing, states = project_state(state, camera, rules, sh_degree, named, dtype)
+    else:
+        projection = project_scene(state, camera, rules, numbers, choices, sh_degree)
+        states = projection.states
+        drawing = find_order(states, state, camera, rules, named)
     planes = draw_splats(projection, drawing, camera, numbers, choices, backdrop)
     image, alphas = compose_image(planes, camera, rules, backdrop, quantizes=quantizes)
-    return Rendering(image, alphas, _count(projection.states, drawing, state, named), rules)
+    return Rendering(image, alphas, _count(states, drawing, state, named), rules)
 
 
 def _compensated(model: Model, state: SceneState, antialias: bool | None) -> Model:

@@ -2,37 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from gsplat_tools import parallel
-from gsplat_tools.attributes.activations import sigmoid
-from gsplat_tools.attributes.covariance import covariance_triangles
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.codecs import visionary_buffers
 from gsplat_tools.codecs.visionary_buffers import Precision, ShLayout
-from gsplat_tools.constants import SH_C0
+from gsplat_tools.reference._visionary_stages import RECORD, RenderMode, Settings, pack_records, preprocess_scene
 from gsplat_tools.reference.camera import Camera
-from gsplat_tools.reference.sorting import LAST_KEY, sort_pairs, view_rows
+from gsplat_tools.reference.motion import SceneState
+from gsplat_tools.reference.sorting import LAST_KEY, sort_pairs
 
-RenderMode = Literal["color", "normal", "depth"]
-
-RECORD = np.dtype(
-    [("v_0", "<f2", 2), ("v_1", "<f2", 2), ("pos", "<f2", 2), ("posz", "<f4"), ("color_0", "<f2", 2), ("color_1", "<f2", 2)]
-)
-"""A splat record, 24 bytes: axes over the viewport, ndc x y (y up), ndc z, red green, blue opacity."""
-assert RECORD.itemsize == 24
+__all__ = [
+    "INITIAL_TOTAL",
+    "KEYS_PER_BLOCK",
+    "RECORD",
+    "Counters",
+    "Preprocessed",
+    "RenderMode",
+    "count_frame",
+    "merge_models",
+    "preprocess",
+    "sort_records",
+]
 
 KEYS_PER_BLOCK = 3840
 """Keys that a workgroup of the sorter takes: 256 threads of 15."""
 
 INITIAL_TOTAL = 1_000_000
 """Splats that the buffers are made for at first; their capacity is 5/4 of the total."""
-
-_MIN_CUTOFF_SCALE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +102,8 @@ class Preprocessed:
         SortInfos, DrawIndirect and DispatchIndirect.
     splat_ids
         (K,) uint32 splat that each record came from.
+    num_splats
+        Splats that were preprocessed.
     culled
         Splats that the rules left out.
     invalid
@@ -115,6 +118,7 @@ class Preprocessed:
     payload: NDArray[np.uint32]
     counters: Counters
     splat_ids: NDArray[np.uint32]
+    num_splats: int
     culled: int
     invalid: int
     undefined_eigenvectors: int
@@ -194,57 +198,36 @@ def preprocess(
     preprocess.wgsl of Visionary-Laboratory/visionary @ c5d7070; docs/visionary.md says where documentation and shader
     part.
     """
-    from gsplat_tools.kernels import visionary as kernel
-
     if dtype not in ("float32", "float64"):
         raise ValueError(f"dtype must be 'float32' or 'float64', got {dtype!r}")
-    for name, value, choices in (
-        ("sh_layout", sh_layout, get_args(ShLayout)),
-        ("precision", precision, get_args(Precision)),
-        ("render_mode", render_mode, get_args(RenderMode)),
-    ):
-        if value not in choices:
-            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
-    if sh_degree is not None and not 0 <= sh_degree <= visionary_buffers.MAX_SH_DEGREE:
-        raise ValueError(f"sh_degree must lie in 0..{visionary_buffers.MAX_SH_DEGREE}, got {sh_degree}")
-    for name, number, least in (
-        ("kernel_size", kernel_size, 0.0),
-        ("gaussian_scaling", gaussian_scaling, 0.0),
-        ("opacity_scale", opacity_scale, 0.0),
-        ("cutoff_scale", cutoff_scale, _MIN_CUTOFF_SCALE),
-    ):
-        if not (np.isfinite(number) and number >= least):
-            raise ValueError(f"{name} must be finite and at least {least:g}, got {number}")
-    if max_world_trace is not None and np.isnan(max_world_trace):
-        raise ValueError("max_world_trace must be a number or None, got nan")
-    matrix = np.eye(4) if model_matrix is None else np.array(model_matrix, np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise ValueError("model_matrix must hold (4, 4) finite numbers with the last row 0 0 0 1")
-
-    uniforms = _uniforms(cloud, camera, matrix, dtype)
-    uniforms[[kernel.KERNEL_SIZE, kernel.GAUSSIAN_SCALING]] = kernel_size, gaussian_scaling
-    uniforms[[kernel.OPACITY_SCALE, kernel.CUTOFF_SCALE]] = opacity_scale, cutoff_scale
-    uniforms[kernel.MAX_WORLD_TRACE] = np.inf if max_world_trace is None else max_world_trace
-    uniforms[kernel.MIP] = mip
-    uniforms[kernel.RENDER_MODE] = {
-        "color": kernel.MODE_COLOR,
-        "normal": kernel.MODE_NORMAL,
-        "depth": kernel.MODE_DEPTH,
-    }[render_mode]
-    degree = min(cloud.sh_degree, visionary_buffers.MAX_SH_DEGREE if sh_degree is None else sh_degree)
-    eye = _eye(cloud, camera, matrix).astype(dtype)
-
-    def preprocess_block(block: tuple[int, int]) -> tuple[NDArray[Any], NDArray[np.uint32], NDArray[np.uint8]]:
-        part = cloud.take(slice(*block))
-        splats = _decoded_splats(part, eye, degree, precision, sh_layout, raw_color=raw_color)
-        values = np.empty((len(part), kernel.VALUES_SIZE), dtype)
-        differences, states = np.empty(len(part), dtype), np.empty(len(part), np.uint8)
-        kernel.preprocess(splats, uniforms, values, differences, states)
-        is_drawn = _is_drawn(states)
-        return _records(values[is_drawn]), differences[is_drawn].astype(np.float32).view(np.uint32), states
-
-    blocks = parallel.map_ordered(preprocess_block, parallel.blocks(len(cloud)))
-    return _join(list(blocks), len(cloud))
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision must be one of {', '.join(get_args(Precision))}, got {precision!r}")
+    settings = Settings(
+        kernel_size=kernel_size,
+        sh_degree=sh_degree,
+        raw_color=raw_color,
+        sh_layout=sh_layout,
+        precision=precision,
+        max_world_trace=max_world_trace,
+        gaussian_scaling=gaussian_scaling,
+        opacity_scale=opacity_scale,
+        cutoff_scale=cutoff_scale,
+        render_mode=render_mode,
+        mip=mip,
+        model_matrix=model_matrix,
+    )
+    found = preprocess_scene(SceneState(cloud, cloud.means, None, None), camera, settings, dtype)
+    return Preprocessed(
+        records=pack_records(found.values),
+        keys=found.keys,
+        payload=np.arange(len(found.keys), dtype=np.uint32),
+        counters=count_frame(len(cloud), len(found.keys)),
+        splat_ids=found.splat_ids,
+        num_splats=len(cloud),
+        culled=found.culled,
+        invalid=found.invalid,
+        undefined_eigenvectors=found.undefined_eigenvectors,
+    )
 
 
 def sort_records(preprocessed: Preprocessed) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
@@ -302,102 +285,36 @@ def count_frame(num_splats: int, num_records: int) -> Counters:
     )
 
 
-def _uniforms(cloud: GaussianCloud, camera: Camera, matrix: NDArray[np.float64], dtype: DTypeLike) -> NDArray[Any]:
-    """Return what the kernel reads about camera and model matrix."""
-    from gsplat_tools.kernels import visionary as kernel
+def merge_models(frames: Sequence[Preprocessed]) -> Preprocessed:
+    """Join the frames of several models, preprocessed one after the other, into the buffers that they share.
 
-    numbers = np.zeros(kernel.UNIFORMS_SIZE, np.float64)
-    numbers[kernel.VIEW : kernel.VIEW + 12] = view_rows(camera, cloud.origin, matrix)
-    numbers[kernel.ROTATION : kernel.ROTATION + 9] = camera.viewmat[:3, :3].ravel()
-    numbers[kernel.LINEAR : kernel.LINEAR + 9] = matrix[:3, :3].ravel()
-    numbers[[kernel.FX, kernel.FY]] = camera.K[0, 0], camera.K[1, 1]
-    numbers[kernel.SHIFT_X] = 2 * camera.K[0, 2] / camera.width - 1
-    numbers[kernel.SHIFT_Y] = 2 * camera.K[1, 2] / camera.height - 1
-    numbers[[kernel.WIDTH, kernel.HEIGHT]] = camera.width, camera.height
-    depth_range = camera.far - camera.near
-    numbers[[kernel.CLIP_SLOPE, kernel.CLIP_SHIFT]] = camera.far / depth_range, -camera.far * camera.near / depth_range
-    uniforms = numbers.astype(dtype)
-    # As the shader finds it in the projection matrix, with the error that this has in float32.
-    with np.errstate(divide="ignore", over="ignore"):
-        uniforms[kernel.Z_FAR] = -uniforms[kernel.CLIP_SHIFT] / (uniforms[kernel.CLIP_SLOPE] - uniforms.dtype.type(1))
-    return uniforms
+    Parameters
+    ----------
+    frames
+        One frame a model, in drawing order of the scene graph, of one camera.
 
+    Returns
+    -------
+    Preprocessed
+        Records of all models behind one another, as on a device that ran the passes in turn; the payload counts through.
+        `splat_ids` counts through the splats of all models, the sum of those before a model being its baseOffset.
 
-def _eye(cloud: GaussianCloud, camera: Camera, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the camera in the space of the means; exact for rotations with a uniform scale."""
-    linear = matrix[:3, :3]
-    squared_scale = max(1e-12, float((linear**2).sum()) / 3)
-    position = camera.position - linear @ cloud.origin - matrix[:3, 3]
-    return np.asarray(linear.T @ position / squared_scale)
-
-
-def _decoded_splats(
-    part: GaussianCloud, eye: NDArray[Any], degree: int, precision: Precision, layout: ShLayout, *, raw_color: bool
-) -> NDArray[Any]:
-    """Return splats with covariances and colors as the shader reads them from buffers of this precision."""
-    from gsplat_tools.kernels import rules as R
-    from gsplat_tools.kernels import visionary as kernel
-    from gsplat_tools.kernels.sh_eval import BAND_4_FIRST, evaluate_colors
-
-    # Overflow becomes infinity, which is counted as invalid.
-    with np.errstate(over="ignore", invalid="ignore"):
-        covariances = covariance_triangles(part.quats, part.log_scales)
-    words = visionary_buffers.encode_gaussians(part.means, sigmoid(part.opacity_logits), covariances, precision=precision)
-    means, opacities, covariances = visionary_buffers.decode_gaussians(words, precision=precision)
-    splats = np.empty((len(part), R.SPLAT_SIZE), eye.dtype)
-    splats[:, R.MEAN : R.MEAN + 3] = means
-    splats[:, kernel.COVARIANCE : kernel.COVARIANCE + 6] = covariances
-    splats[:, R.OPACITY] = opacities
-    if raw_color:
-        colors = part.sh0 * np.float32(SH_C0) + np.float32(0.5)
-        words = visionary_buffers.encode_raw_colors(colors, precision=precision)
-        splats[:, R.COLOR : R.COLOR + 3] = visionary_buffers.decode_raw_colors(words, precision=precision)
-        return splats
-    shN = part.shN[:, : (degree + 1) ** 2 - 1]
-    words = visionary_buffers.encode_sh(part.sh0, shN, precision=precision, layout=layout)
-    sh0, shN = visionary_buffers.decode_sh(words, degree, precision=precision, layout=layout)
-    evaluate_colors(sh0, shN, eye, degree, eye.dtype.type(BAND_4_FIRST), 0, splats)
-    return splats
-
-
-def _records(values: NDArray[Any]) -> NDArray[Any]:
-    """Round the values of records, as columns in kernels/visionary.py, to RECORD."""
-    from gsplat_tools.kernels import visionary as kernel
-
-    records = np.empty(len(values), RECORD)
-    for name, first in (
-        ("v_0", kernel.VAL_V1),
-        ("v_1", kernel.VAL_V2),
-        ("pos", kernel.VAL_POS),
-        ("color_0", kernel.VAL_COLOR),
-        ("color_1", kernel.VAL_COLOR + 2),
-    ):
-        records[name] = visionary_buffers.to_halves(values[:, first : first + 2])
-    records["posz"] = values[:, kernel.VAL_POSZ]
-    return records
-
-
-def _is_drawn(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which splats have a record."""
-    from gsplat_tools.kernels import rules as R
-
-    return np.asarray((states & ~np.uint8(R.EIGENVECTOR_UNDEFINED)) == R.DRAWN)
-
-
-def _join(blocks: list[tuple[NDArray[Any], NDArray[np.uint32], NDArray[np.uint8]]], num_splats: int) -> Preprocessed:
-    """Return the buffers of all blocks."""
-    from gsplat_tools.kernels import rules as R
-
-    records = np.concatenate([np.empty(0, RECORD), *(block[0] for block in blocks)])
-    keys = np.concatenate([np.empty(0, np.uint32), *(block[1] for block in blocks)])
-    states = np.concatenate([np.empty(0, np.uint8), *(block[2] for block in blocks)])
+    Notes
+    -----
+    The sorter's extra workgroup is asked for once, by the first splat of the model with baseOffset 0.
+    """
+    records = np.concatenate([np.empty(0, RECORD), *(frame.records for frame in frames)])
+    splats = sum(frame.num_splats for frame in frames)
+    offsets = np.cumsum([0, *(frame.num_splats for frame in frames)])
+    ids = [frame.splat_ids.astype(np.int64) + offset for frame, offset in zip(frames, offsets[:-1], strict=True)]
     return Preprocessed(
         records=records,
-        keys=keys,
+        keys=np.concatenate([np.empty(0, np.uint32), *(frame.keys for frame in frames)]),
         payload=np.arange(len(records), dtype=np.uint32),
-        counters=count_frame(num_splats, len(records)),
-        splat_ids=np.flatnonzero(_is_drawn(states)).astype(np.uint32),
-        culled=int(np.count_nonzero(states == R.CULLED)),
-        invalid=int(np.count_nonzero(states == R.INVALID)),
-        undefined_eigenvectors=int(np.count_nonzero(states == R.DRAWN + R.EIGENVECTOR_UNDEFINED)),
+        counters=count_frame(splats, len(records)),
+        splat_ids=np.concatenate([np.empty(0, np.uint32), *ids]).astype(np.uint32),
+        num_splats=splats,
+        culled=sum(frame.culled for frame in frames),
+        invalid=sum(frame.invalid for frame in frames),
+        undefined_eigenvectors=sum(frame.undefined_eigenvectors for frame in frames),
     )

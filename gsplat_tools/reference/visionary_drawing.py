@@ -8,13 +8,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools import parallel
 from gsplat_tools.reference import models
 from gsplat_tools.reference._stages import Projection, compose_image, draw_splats
+from gsplat_tools.reference._visionary_stages import RECORD, Settings, pack_records, preprocess_scene, unpack_records
 from gsplat_tools.reference.camera import Camera
-from gsplat_tools.reference.visionary import RECORD, Preprocessed, sort_records
-
-# Pixels that are looked at beyond the cut-off, so that rounding loses none.
-_SLACK = 1e-4
+from gsplat_tools.reference.models import Model
+from gsplat_tools.reference.motion import SceneState
+from gsplat_tools.reference.sorting import sort_pairs
+from gsplat_tools.reference.visionary import Preprocessed, sort_records
 
 
 def draw_records(
@@ -70,51 +72,82 @@ def draw_records(
     model = models.find_model("visionary")
     numbers = models.rule_array(model, camera, dtype, scale_factor=1.0, brightness=1.0)
     choices = models.choice_array(model, scale_factor=1.0, gamma_to_linear=False, quantizes=quantizes)
-    projection, shows = _project(preprocessed.records, camera, model.cutoff, dtype)
+    projection = _place(unpack_records(preprocessed.records, dtype), camera, model)
     order = sort_records(preprocessed)[1]
-    planes = draw_splats(projection, order[shows[order]], camera, numbers, choices, backdrop)
+    planes = draw_splats(projection, order[_shows(projection)[order]], camera, numbers, choices, backdrop)
     return compose_image(planes, camera, model, backdrop, quantizes=quantizes)
 
 
-def _project(records: NDArray[Any], camera: Camera, cutoff: float, dtype: str) -> tuple[Projection, NDArray[np.bool_]]:
-    """Return records as blending reads them, and which of them touch a pixel."""
+def project_state(
+    state: SceneState, camera: Camera, model: Model, sh_degree: int | None, named: NDArray[np.uint32] | None, dtype: str
+) -> tuple[Projection, NDArray[np.uint32], NDArray[np.uint8]]:
+    """Preprocess a scene to records, sort them, and return them as blending reads them.
+
+    Parameters
+    ----------
+    state
+        N splats at a time.
+    camera
+        In world coordinates.
+    model
+        "visionary", whose variant says whether records are rounded to halves.
+    sh_degree
+        Highest SH band used; by default what scene and model both have.
+    named
+        Splats in drawing order, far first; None sorts by the keys of the records.
+    dtype
+        What is computed in.
+
+    Returns
+    -------
+    tuple
+        Projection of the K records · which of them to draw, in drawing order · (N,) states of the splats.
+    """
+    settings = Settings(
+        kernel_size=model.low_pass,
+        sh_degree=None if sh_degree is None else min(sh_degree, model.max_sh_degree),
+        precision="exact",
+        mip=model.compensation != "none",
+    )
+    found = preprocess_scene(state, camera, settings, dtype)
+    values = unpack_records(pack_records(found.values), dtype) if model.half_records else found.values
+    projection = _place(values, camera, model)
+    ids, shows = found.splat_ids, _shows(projection)
+    states = found.states.copy()
+    states[ids[~shows]] = projection.states[~shows]
+    if state.is_visible is not None:
+        shows &= state.is_visible[ids]
+    if named is None:
+        order = sort_pairs(found.keys, np.arange(len(ids), dtype=np.uint32))[1]
+    else:
+        rows = np.full(len(states), len(ids), np.uint32)
+        rows[ids] = np.arange(len(ids))
+        order = rows[named]
+        order = order[order < len(ids)]
+    drawing = order[shows[order]]
+    return projection, np.ascontiguousarray(drawing), states
+
+
+def _place(values: NDArray[Any], camera: Camera, model: Model) -> Projection:
+    """Return the values of records as blending reads them."""
+    from gsplat_tools.kernels import rules as R
+    from gsplat_tools.kernels.visionary import place
+
+    f = values.dtype.type
+    records = np.zeros((len(values), R.RECORD_SIZE), values.dtype)
+    bounds, states = np.zeros((len(values), 4), np.int32), np.zeros(len(values), np.uint8)
+    cutoff, width, height = f(model.cutoff), f(camera.width), f(camera.height)
+
+    def place_block(start: int, stop: int) -> None:
+        part = slice(start, stop)
+        place(values[part], cutoff, width, height, records[part], bounds[part], states[part])
+
+    parallel.run_blocks(place_block, len(values))
+    return Projection(records, bounds, states)
+
+
+def _shows(projection: Projection) -> NDArray[np.bool_]:
+    """Return which records touch a pixel."""
     from gsplat_tools.kernels import rules as R
 
-    size = np.array([camera.width, camera.height], np.float64)
-    # Rows of pixels go down, ndc goes up.
-    flip = np.array([1.0, -1.0])
-    center = (records["pos"].astype(np.float64) * flip + 1) / 2 * size
-    v1, v2 = (records[name].astype(np.float64) * size * flip for name in ("v_0", "v_1"))
-    reach = np.sqrt(cutoff) * np.hypot(v1, v2) * (1 + _SLACK) + _SLACK
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        area = v1[:, 0] * v2[:, 1] - v2[:, 0] * v1[:, 1]
-        ux, uy, vx, vy = v2[:, 1] / area, -v2[:, 0] / area, -v1[:, 1] / area, v1[:, 0] / area
-        s = np.hypot(ux, vx)
-        k, h = (ux * uy + vx * vy) / s, 1 / (np.abs(area) * s)
-    opacity = records["color_1"][:, 1].astype(np.float64)
-    is_defined = np.isfinite(s + k + h + center.sum(axis=1) + reach.sum(axis=1) + opacity) & (s > 0) & (h > 0)
-
-    rows = np.zeros((len(records), R.RECORD_SIZE), np.float64)
-    rows[:, [R.REC_X, R.REC_Y]] = center
-    for column, values in (
-        (R.REC_S, s),
-        (R.REC_K, k),
-        (R.REC_H, h),
-        (R.REC_UX, ux),
-        (R.REC_UY, uy),
-        (R.REC_VX, vx),
-        (R.REC_VY, vy),
-        (R.REC_OPACITY, opacity),
-        (R.REC_R, records["color_0"][:, 0]),
-        (R.REC_G, records["color_0"][:, 1]),
-        (R.REC_B, records["color_1"][:, 0]),
-    ):
-        rows[:, column] = values
-    rows[:, R.REC_Q] = cutoff * (1 + _SLACK) + _SLACK
-    rows[:, R.REC_BOX] = 2.0
-    low, high = (np.where(is_defined[:, None], bound, 0.0) for bound in (center - reach, center + reach))
-    starts = np.clip(np.floor(low), 0, size).astype(np.int32)
-    stops = np.clip(np.ceil(high), 0, size).astype(np.int32)
-    shows = is_defined & (opacity > 0) & (starts < stops).all(axis=1)
-    bounds = np.ascontiguousarray(np.stack([starts[:, 0], stops[:, 0], starts[:, 1], stops[:, 1]], axis=1))
-    return Projection(rows.astype(dtype), bounds, np.zeros(len(records), np.uint8)), shows
+    return np.asarray(projection.states == R.DRAWN)
