@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -23,6 +24,7 @@ REST_COEFFICIENTS = tuple((degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGRE
 
 _WIDTHS = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": None, "sh0": 3}
 _MOTION_WIDTHS = {"velocities": 3, "times": None, "durations": None}
+_FORMAT_ID = re.compile("[a-z0-9][a-z0-9-]{0,31}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +63,8 @@ class GaussianCloud:
         (3,) float64; world position = origin + means.
     splat_model
         "default", "antialiased" (Mip-Splatting) or "2dgs" (flat splats).
+    source_format
+        Id of the lossy format that the values come from, as far as that is known; else empty.
     extra
         Other per-splat properties by name, each (N,) or (N, ...), kept as they were found.
 
@@ -84,6 +88,7 @@ class GaussianCloud:
     coordinate_system: str = "unknown"
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     splat_model: SplatModel = "default"
+    source_format: str = ""
     extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -114,6 +119,8 @@ class GaussianCloud:
             )
         if self.splat_model not in get_args(SplatModel):
             raise CloudError(f"expected one of {get_args(SplatModel)}, found {self.splat_model!r}", field="splat_model")
+        if source_format_of(self.source_format) != self.source_format:
+            raise CloudError(f"expected the id of a format, found {self.source_format!r}", field="source_format")
         origin = np.array(self.origin, np.float64)
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise CloudError(f"expected three finite numbers, found {self.origin!r}", field="origin")
@@ -164,6 +171,11 @@ class GaussianCloud:
         if len(self) == 0:
             return None
         return self.origin + self.means.min(axis=0), self.origin + self.means.max(axis=0)
+
+
+def source_format_of(value: object) -> str:
+    """Return what a file says that its values come from; empty where that is no id of a format."""
+    return value if isinstance(value, str) and _FORMAT_ID.fullmatch(value) else ""
 
 
 def concatenate(clouds: Sequence[GaussianCloud]) -> GaussianCloud:

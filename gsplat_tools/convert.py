@@ -18,7 +18,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import AttributeTally, compare_rendered, paired, sample
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, ValidationError
 from gsplat_tools.formats.base import Format, Scene
-from gsplat_tools.formats.loading import open_scene
+from gsplat_tools.formats.loading import inspect_file, open_scene
 from gsplat_tools.formats.preparing import Prepared
 from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, save
 from gsplat_tools.progress import stage
@@ -56,6 +56,7 @@ class ConversionReport:
     """What one conversion did; `to_json` is what `gsplat-convert --json` prints."""
 
     source: str
+    source_format: str
     path: Path
     format: str
     bytes: int
@@ -72,6 +73,7 @@ class ConversionReport:
         """Return the report with the fixed names of the command line's JSON."""
         return {
             "source": self.source,
+            "source_format": self.source_format,
             "target": {"path": str(self.path), "format": self.format, "bytes": self.bytes},
             "splats": self.splats,
             "sh_degree": self.sh_degree,
@@ -157,7 +159,7 @@ def convert(
         warnings.simplefilter("always", GsplatWarning)
         start = time.perf_counter()
         in_chunks = record.streams and (options.get("order") or record.order) == "none"
-        with _open(sources, in_chunks, read_options or {}, options) as opened:
+        with _open(sources, in_chunks, read_options or {}, options) as (opened, source_format):
             scene, retimed = retime(opened, record, motion, time_at, frame, interpolation, options)
             seconds["read"] = time.perf_counter() - start
             saved = save(
@@ -173,6 +175,7 @@ def convert(
         seconds[name] += spent
     return ConversionReport(
         source=", ".join(map(str, sources)),
+        source_format=source_format,
         path=saved.path,
         format=saved.format,
         bytes=saved.bytes,
@@ -190,15 +193,17 @@ def convert(
 @contextmanager
 def _open(
     sources: Sequence[str | Path], in_chunks: bool, read_options: dict[str, Any], options: dict[str, Any]
-) -> Iterator[Scene]:
-    """Open one file, or several, a folder or a glob as a sequence."""
+) -> Iterator[tuple[Scene, str]]:
+    """Open one file, or several, a folder or a glob as a sequence; yield it and the id of its format."""
+    found: list[Format] = []
     if len(sources) == 1 and Path(sources[0]).is_file():
-        with open_scene(Path(sources[0]), in_chunks=in_chunks, **read_options) as scene:
-            yield scene
+        with open_scene(Path(sources[0]), in_chunks=in_chunks, on_format=found.append, **read_options) as scene:
+            yield scene, found[0].id
         return
-    from gsplat_tools.formats.sequences import open_sequence
+    from gsplat_tools.formats.sequences import frame_files, open_sequence
 
-    yield open_sequence(sources, frame_times=options.pop("frame_times", None))
+    scene = open_sequence(sources, frame_times=options.pop("frame_times", None))
+    yield scene, inspect_file(frame_files(sources)[0])[0].id
 
 
 def _validate(

@@ -87,6 +87,17 @@ class GaussianSequence:
             raise CloudError(f"expected a frame in 0..{len(self) - 1}, found {frame_id}", frame=frame_id)
         return self._load_frame(frame_id)
 
+    def map(self, function: Callable[[GaussianCloud], GaussianCloud]) -> GaussianSequence:
+        """Return these frames with `function`, which keeps count and degree, applied to each as it is loaded."""
+        return GaussianSequence(
+            lambda frame_id: function(self.frame(frame_id)),
+            num_splats=self.num_splats,
+            sh_degree=self.sh_degree,
+            frame_times=None if self.is_uniform else self.frame_times,
+            num_frames=len(self),
+            load_bounds=self._load_bounds,
+        )
+
     def bracket(self, t: float) -> tuple[int, int, float]:
         """Return (i0, i1, a): the keyframes around normalized time `t` and the fraction of the second.
 

@@ -137,6 +137,11 @@ def _takes(record: Format, flag: str, name: str) -> bool:
     help="Write the residual of every splat of the fit, and a picture of them.",
 )
 @click.option(
+    "--lod",
+    type=click.IntRange(min=0),
+    help="Level of detail of a streamed SOG scene (lod-meta.json); 0, the default, is the finest.",
+)
+@click.option(
     "--shn-order", type=click.Choice(["interleaved", "channel-major"]), help="SH order in .sog4d sources of other tools."
 )
 @click.option(
@@ -276,7 +281,7 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
         "motion": Motion(
             frames=given["frames"], tolerance=given["tolerance"], fit=given["fit_motion"], fit_report=given["fit_report"]
         ),
-        "read_options": {"shn_order": given["shn_order"]} if given["shn_order"] else {},
+        "read_options": {name: given[name] for name in ("lod", "shn_order") if given[name] is not None},
         **general,
         **({"frame_times": given["frame_times"]} if given["frame_times"] else {}),
     }

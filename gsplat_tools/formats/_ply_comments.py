@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.attributes.coordinate_systems import is_known
-from gsplat_tools.cloud import GaussianCloud, SplatModel, TimeModel
+from gsplat_tools.cloud import GaussianCloud, SplatModel, TimeModel, source_format_of
 from gsplat_tools.constants import TEMPORAL_CUTOFF
 from gsplat_tools.errors import CorruptDataError
 from gsplat_tools.formats._ply_header import PlyHeader
@@ -32,6 +32,7 @@ class SplatComments:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     time_model: TimeModel | None = None
     temporal_cutoff: float = TEMPORAL_CUTOFF
+    source_format: str = ""
 
 
 def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
@@ -52,12 +53,13 @@ def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
     Source
     ------
     `SplatRenderMode: default | mip | 2dgs` is Brush's comment, `antialiased 0 | 1` is Postshot's; the last one wins, as in
-    splat-transform. origin, coordinate_system, time_model and temporal_cutoff are ours.
+    splat-transform. origin, coordinate_system, time_model, temporal_cutoff and source_format are ours.
     """
     model: SplatModel = "default"
     system, origin = "unknown", np.zeros(3)
     time_model: TimeModel | None = None
     cutoff = TEMPORAL_CUTOFF
+    source = ""
     for comment in header.comments:
         words = comment.replace(":", " ").split()
         key, values = (words[0].lower(), words[1:]) if words else ("", [])
@@ -71,7 +73,9 @@ def splat_comments(header: PlyHeader, *, is_flat: bool) -> SplatComments:
             origin = _origin(values, origin)
         elif key == "temporal_cutoff" and len(values) == 1:
             cutoff = _cutoff(values[0], cutoff)
-    return SplatComments("2dgs" if is_flat else model, system, origin, time_model, cutoff)
+        elif key == "source_format" and len(values) == 1:
+            source = source_format_of(values[0])
+    return SplatComments("2dgs" if is_flat else model, system, origin, time_model, cutoff, source)
 
 
 def _cutoff(word: str, otherwise: float) -> float:
@@ -103,6 +107,8 @@ def comment_lines(template: GaussianCloud) -> list[str]:
         lines.append("comment SplatRenderMode: 2dgs")
     if template.coordinate_system != "unknown":
         lines.append(f"comment coordinate_system {template.coordinate_system}")
+    if template.source_format:
+        lines.append(f"comment source_format {template.source_format}")
     if template.origin.any():
         lines.append("comment origin " + " ".join(repr(float(value)) for value in template.origin))
     if template.has_motion and template.time_model != "window":

@@ -105,6 +105,8 @@ class Format:
         Fewest splats that a file may hold.
     lossless
         Whether every attribute comes back with the same bits.
+    precise
+        Whether nothing changes but roundings of float32; values from other formats that are not lossless have lost more.
     holds_sequences, holds_motion, holds_extra
         Whether several frames, velocities with times, and other properties can be stored.
     fits_sequences
@@ -172,6 +174,7 @@ class Format:
     holds_extra: bool = False
     folder: FolderLayout | None = None
     fits_sequences: bool = False
+    precise: bool = False
     stores_origin: bool = False
     stores_coordinates: bool = False
     stores_splat_model: bool = False
@@ -184,3 +187,8 @@ class Format:
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     knobs: Mapping[str, Knob] = field(default_factory=general_knobs)
     model: tuple[str, str | None] = ("inria", None)
+
+    @property
+    def is_lossy(self) -> bool:
+        """Whether values are quantized."""
+        return not (self.lossless or self.precise)

@@ -9,15 +9,17 @@ from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar, cast
 
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, UnknownFormatError, counts_in_words
 from gsplat_tools.formats._stream import seekable
-from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format
+from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format, Scene
 from gsplat_tools.formats.registry import detect, find_format
 from gsplat_tools.sequence import GaussianSequence
+
+AnyScene = TypeVar("AnyScene", bound=Scene)
 
 
 @contextmanager
@@ -104,7 +106,7 @@ def load(path: str | Path, *, strict: bool = False, **options: Any) -> GaussianC
         try:
             checked = read_options(record, options)
             assert record.read is not None
-            scene = record.read(stream, checked)
+            scene = with_source_format(record.read(stream, checked), record)
         except BaseException:
             stream.close()
             raise
@@ -113,6 +115,18 @@ def load(path: str | Path, *, strict: bool = False, **options: Any) -> GaussianC
             return scene
         stream.close()
         return drop_or_refuse(scene, strict=strict)
+
+
+def with_source_format(scene: AnyScene, record: Format) -> AnyScene:
+    """Return the scene with a note of the lossy format that it was read from, if it was."""
+    if not record.is_lossy:
+        return scene  # what an earlier file was is kept where the format has a place for it
+
+    def note(cloud: GaussianCloud) -> GaussianCloud:
+        return cloud.replace(source_format=record.id)
+
+    noted = note(scene) if isinstance(scene, GaussianCloud) else scene.map(note)
+    return cast("AnyScene", noted)
 
 
 def drop_or_refuse(cloud: GaussianCloud, *, strict: bool) -> GaussianCloud:
@@ -138,7 +152,12 @@ def warn_dropped(dropped: dict[str, int], count: int) -> None:
 
 @contextmanager
 def open_scene(
-    path: Path, *, in_chunks: bool, as_format: str | None = None, **options: Any
+    path: Path,
+    *,
+    in_chunks: bool,
+    as_format: str | None = None,
+    on_format: Callable[[Format], object] | None = None,
+    **options: Any,
 ) -> Iterator[CloudChunks | GaussianCloud | GaussianSequence]:
     """Open a scene for one conversion, invalid splats included: in chunks if asked for and its format allows, else whole."""
     with located(path):
@@ -147,10 +166,12 @@ def open_scene(
         else:
             stream, record = path.open("rb"), find_format(as_format)
         with stream:
+            if on_format is not None:
+                on_format(record)
             checked = read_options(record, options)
             reader = (record.read_chunks if in_chunks else None) or record.read
             assert reader is not None
-            scene = reader(stream, checked)
+            scene = with_source_format(reader(stream, checked), record)
             if isinstance(scene, CloudChunks):
                 scene = replace(scene, iterate=partial(_located_chunks, path, scene.iterate))
             yield scene

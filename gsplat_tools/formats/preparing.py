@@ -259,6 +259,15 @@ class _Fit:
         self._drops_extra = bool(template.extra) and not target.holds_extra
         if self._drops_extra:
             self._lose(f"{len(template.extra)} extra properties ({', '.join(sorted(template.extra))})", "extra")
+        if template.source_format and target.is_lossy:
+            warnings.warn(
+                LossyConversionWarning(
+                    f"the source was stored as {template.source_format}, which is lossy, and {target.id} is lossy too: errors "
+                    "add up; convert from the original where there is one",
+                    code="lossy-to-lossy",
+                ),
+                stacklevel=4,
+            )
         if template.splat_model != "default" and not target.stores_splat_model:
             self._lose(f"the splat model {template.splat_model!r}", "splat-model")
         # The box follows the axes: convert its corners like any position.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsplat_tools.attributes.coordinate_systems import UNKNOWN, is_known
 from gsplat_tools.attributes.motion import reach
-from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud, SplatModel, TimeModel
+from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud, SplatModel, TimeModel, source_format_of
 from gsplat_tools.constants import MAX_SH_DEGREE, TEMPORAL_CUTOFF
 from gsplat_tools.errors import CorruptDataError
 from gsplat_tools.formats.pack.container import LAYOUTS, StreamLayout
@@ -40,7 +40,7 @@ class Description:
         "spark" or "uncompressed"; splats; highest SH band.
     bounds, motion_bounds
         Smallest box round the stored positions, and the same grown by what motion may add, or None.
-    origin, coordinate_system, splat_model, time_model, temporal_cutoff
+    origin, coordinate_system, splat_model, source_format, time_model, temporal_cutoff
         As `GaussianCloud` has them; time_model None without motion.
     encoding, rotation
         Ranges and choice of rotation frames of layout "spark".
@@ -55,6 +55,7 @@ class Description:
     coordinate_system: str = UNKNOWN
     splat_model: SplatModel = "default"
     time_model: TimeModel | None = None
+    source_format: str = ""
     temporal_cutoff: float = TEMPORAL_CUTOFF
     encoding: SplatEncoding | None = None
     rotation: str | None = None
@@ -82,6 +83,8 @@ class Description:
             "splat_model": self.splat_model,
         }
         if self.encoding is not None:
+        if self.source_format:
+            entry["source_format"] = self.source_format
             entry["splat_encoding"] = self.encoding.to_json()
         if self.rotation is not None:
             entry["rotation"] = self.rotation
@@ -122,6 +125,7 @@ class Description:
             coordinate_system=system,
             splat_model=_choice(entry, "splat_model", get_args(SplatModel)),
             time_model=None if time_model is None else _choice(entry, "time_model", get_args(TimeModel)),
+            source_format=source_format_of(entry.get("source_format")),
             temporal_cutoff=_cutoff(entry),
             encoding=SplatEncoding.from_json(ranges) if layout == "spark" else None,
             rotation=rotation if isinstance(rotation, str) else None,
@@ -134,6 +138,7 @@ class Description:
             "coordinate_system": self.coordinate_system,
             "splat_model": self.splat_model,
             "time_model": self.time_model or "window",
+            "source_format": self.source_format,
             "temporal_cutoff": self.temporal_cutoff,
         }
 

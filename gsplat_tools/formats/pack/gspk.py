@@ -61,6 +61,8 @@ def inspect(stream: BinaryIO) -> FileInfo:
         encoding |= {"time_model": description.time_model, "temporal_cutoff": description.temporal_cutoff}
     return FileInfo(
         version=str(container.VERSION),
+    if description.source_format:
+        encoding["source_format"] = description.source_format
         splats=description.count,
         sh_degree=description.degree,
         coordinate_system=description.coordinate_system,
@@ -208,6 +210,7 @@ def facts_of(chunks: CloudChunks, layout: str, **changes: Any) -> Description:
         temporal_cutoff=template.temporal_cutoff,
         **changes,
     )
+        source_format=template.source_format,
 
 
 def bounds(source: GaussianCloud, stream: BinaryIO, _frame: int) -> Bounds:

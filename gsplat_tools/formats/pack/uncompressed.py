@@ -64,6 +64,7 @@ def write(scene: Scene, stream: BinaryIO, options: UncompressedOptions) -> None:
 
 FORMAT = Format(
     id="uncompressed",
+    precise=True,
     title="Uncompressed float32 arrays (.gspk)",
     extensions=(".gspk",),
     spec="docs/formats/uncompressed.md",

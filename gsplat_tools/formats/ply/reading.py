@@ -144,6 +144,7 @@ class PlyReader:
             from gsplat_tools.kernels.columns import scatter_rows
 
             rows = records.view(np.float32).reshape(len(records), -1)
+            source_format=comments.source_format,
             arrays = (cloud.means, cloud.log_scales, cloud.quats, cloud.opacity_logits, cloud.sh0, cloud.shN)
             return bool(scatter_rows(rows, self._columns, self._normal_columns, *arrays))
         names = self.layout.splat_columns

@@ -147,7 +147,9 @@ def encode(cloud: GaussianCloud, options: SogOptions) -> Encoded:
     run_blocks(fill, len(cloud))
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {"generator": f"{GENERATOR} {__version__}"},
+        "asset": {
+            "generator": f"{GENERATOR} {__version__}" + (f" from {cloud.source_format}" if cloud.source_format else "")
+        },
         "count": len(cloud),
         # The specification says `antialias`, the writers in use say `model`.
         **({"model": cloud.splat_model} if cloud.splat_model != "default" else {}),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -60,6 +61,7 @@ def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: So
     archive = ZipWriter(stream)
     deltas = _DeltaFiles(shared, segments) if uses_deltas else None
     ranges: list[tuple[Float32, Float32]] = []
+    sources: set[str] = set()
     clipped: dict[str, int] = {}
 
     def images() -> Iterator[tuple[str, Image]]:
@@ -69,6 +71,7 @@ def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: So
             cloud = frames[frame_id]
             planes = encode_frame(cloud, shared, None if frame_id in starts else previous)
             ranges.append((planes.range_min, planes.range_max))
+            sources.add(cloud.source_format)
             for name, number in planes.clipped.items():
                 clipped[name] = clipped.get(name, 0) + number
             if deltas is not None:
@@ -89,8 +92,11 @@ def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: So
             archive.add(name, data, image_compression)
             if name.endswith("/sh0.webp"):
                 progress.advance(1)
+    meta = _meta(shared, frames.num_splats, segments if uses_deltas else None, times, ranges)
+    lossy = " and ".join(sorted(sources - {""}))
+    meta = replace(meta, generator=f"{meta.generator} from {lossy}") if lossy else meta
     entries = {
-        "meta.json": meta_text(_meta(shared, frames.num_splats, segments if uses_deltas else None, times, ranges)),
+        "meta.json": meta_text(meta),
         **{_centroids_path(palette): _centroid_bytes(palette, options) for palette in shared.palettes},
         **({} if deltas is None else deltas.files),
     }
