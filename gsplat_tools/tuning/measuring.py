@@ -193,13 +193,13 @@ class Workbench:
             for _ in range(repeats):
                 start = time.perf_counter()
                 with open_scene(path, in_chunks=False, as_format=record.id) as decoded:
-                    frames = [_cloud(decoded, frame_id) for frame_id in _drawn_frames(decoded)]
+                    frames = [cloud_of(decoded, frame_id) for frame_id in _drawn_frames(decoded)]
                     seconds = time.perf_counter() - start
                     if isinstance(decoded, GaussianSequence):  # all frames, from the few that were decoded
                         seconds *= len(decoded) / len(frames)
                 decode.append(seconds)
         prepared = given[0].scene
-        written = [_cloud(prepared, frame_id) for frame_id in _drawn_frames(prepared)]
+        written = [cloud_of(prepared, frame_id) for frame_id in _drawn_frames(prepared)]
         for before, after in zip(written, frames, strict=True):
             tally.add(before, after)
         likeness = (
@@ -255,11 +255,20 @@ class Workbench:
             worst_view=worst,
         )
 
+    def squared_errors(self, frames: Sequence[GaussianCloud], model: Model, system: str | None = None) -> list[float]:
+        """Return the mean squared error of every drawn view, of colors clamped to [0, 1]; arguments as in `compare`."""
+        cameras, references = self._reference(model, system)
+        images = self._draw(frames, cameras, model)
+        return [
+            float(np.square(np.clip(a, 0, 1).astype(np.float64) - np.clip(b, 0, 1)).mean())
+            for a, b in zip(references, images, strict=True)
+        ]
+
     def source_frames(self, system: str | None = None) -> list[GaussianCloud]:
         """Return the frames of the source that are drawn, one for a still scene, in the axes of a candidate."""
         from gsplat_tools.ops.coordinates import convert_coordinates
 
-        frames = [_cloud(self.scene, frame_id) for frame_id in _drawn_frames(self.scene)]
+        frames = [cloud_of(self.scene, frame_id) for frame_id in _drawn_frames(self.scene)]
         if system in (None, "unknown", frames[0].coordinate_system):
             return frames
         # A format that is always in one system takes unknown axes as RUB, as `prepare` does.
@@ -293,7 +302,7 @@ def _drawn_frames(scene: Scene) -> list[int]:
     return sorted({round(each) for each in np.linspace(0, len(scene) - 1, RENDERED_FRAMES)})
 
 
-def _cloud(scene: Scene, frame_id: int) -> GaussianCloud:
+def cloud_of(scene: Scene, frame_id: int) -> GaussianCloud:
     """Return a frame, or the still scene, in memory."""
     if isinstance(scene, GaussianSequence):
         return scene.frame(frame_id)
