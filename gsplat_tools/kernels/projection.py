@@ -9,7 +9,6 @@ import numpy as np
 
 from gsplat_tools.kernels import rules as R
 from gsplat_tools.kernels._jit import device, kernel
-from gsplat_tools.kernels.half_floats import round_to_half
 
 # Tiles of the 3DGS rasterizer, px.
 _TILE = 16
@@ -18,10 +17,11 @@ _SLACK = 1e-4
 
 
 @kernel()
-def activate(means, log_scales, quats, opacity_logits, weights, start, stop, splats):
-    """Turn stored values into world-space splats: exp, sigmoid, unit quaternions.
+def activate(means, eye, log_scales, quats, opacity_logits, weights, start, stop, splats):
+    """Turn stored values into splats about the camera: centers relative to it, exp, sigmoid, unit quaternions.
 
     means           float (N, 3)    read
+    eye             float64 (3,)    read; camera in the space of the means. Far from zero, float32 would lose what is near it
     log_scales      float32 (N, 3)  read
     quats           float32 (N, 4)  read, wxyz
     opacity_logits  float32 (N,)    read
@@ -38,7 +38,7 @@ def activate(means, log_scales, quats, opacity_logits, weights, start, stop, spl
         # A quaternion of norm 0 gives NaN, which projection counts as invalid.
         norm = math.sqrt(norm)
         for c in range(3):
-            splats[row, R.MEAN + c] = f(means[i, c])
+            splats[row, R.MEAN + c] = f(np.float64(means[i, c]) - eye[c])
             splats[row, R.SCALE + c] = f(math.exp(np.float64(log_scales[i, c])))
         for c in range(4):
             splats[row, R.QUAT + c] = f(np.float64(quats[i, c]) / norm)
@@ -47,17 +47,27 @@ def activate(means, log_scales, quats, opacity_logits, weights, start, stop, spl
 
 
 @device()
-def _compensation(choices, rules, det, det_blurred):
-    """Return the factor of the opacity that makes up for the low-pass filter."""
+def _length(x, y):
+    """Return the length of a vector whose squares may overflow or vanish."""
+    largest = max(abs(x), abs(y))
+    # Zero and infinity have no ratio to themselves.
+    if largest == 0.0 or largest == np.inf:
+        return largest
+    x, y = x / largest, y / largest
+    return largest * np.sqrt(x * x + y * y)
+
+
+@device()
+def _compensation(choices, rules, area, lambda1, lambda2):
+    """Return the factor of the opacity that makes up for the low-pass filter.
+
+    area is the root of the determinant before the filter, the lambdas are the eigenvalues after it: products of them may
+    overflow, so that ratios are taken first.
+    """
     f = rules.dtype.type
     kind = choices[R.COMPENSATION]
     if kind == R.COMPENSATION_RATIO:
-        return np.sqrt(max(rules[R.COMPENSATION_FLOOR], det / det_blurred))
-    if kind == R.COMPENSATION_VISIONARY:
-        tiny = f(1e-6)
-        if det <= tiny or det_blurred <= tiny:
-            return f(0)
-        return np.sqrt(det / (det_blurred + tiny) + tiny)
+        return np.sqrt(max(rules[R.COMPENSATION_FLOOR], (area / lambda1) * (area / lambda2)))
     return f(1)
 
 
@@ -105,8 +115,6 @@ def project(splats, lens, rules, choices, first, records, bounds, states):
         if not (z > lens[R.Z_MIN] and z < lens[R.Z_MAX]):
             continue
         opacity = splats[row, R.OPACITY]
-        if opacity < rules[R.OPACITY_CULL]:
-            continue
         slope_x, slope_y = x / z, y / z
         center_x = fx * slope_x + lens[R.CX]
         center_y = fy * slope_y + lens[R.CY]
@@ -143,20 +151,21 @@ def project(splats, lens, rules, choices, first, records, bounds, states):
         cross_x = m12 * m23 - m13 * m22
         cross_y = m13 * m21 - m11 * m23
         cross_z = m11 * m22 - m12 * m21
-        det = cross_x * cross_x + cross_y * cross_y + cross_z * cross_z
-        det_blurred = det + low_pass * (a + c) + low_pass * low_pass
+        # Its root, because the determinant itself overflows where the eigenvalues are far from it.
+        area = _length(_length(cross_x, cross_y), cross_z)
+        trace = a + c
         a += low_pass
         c += low_pass
         difference = half * (a - c)
-        spread = np.sqrt(difference * difference + b * b)
+        spread = _length(difference, b)
         lambda1 = half * (a + c) + spread
-        lambda2 = det_blurred / lambda1
+        lambda2 = area * (area / lambda1) + low_pass * ((trace + low_pass) / lambda1)
         if not lambda2 > zero or lambda1 * zero != zero:
             states[i] = R.INVALID
             continue
         if lambda1 < rules[R.SMALLEST]:
             continue
-        opacity *= _compensation(choices, rules, det, det_blurred)
+        opacity *= _compensation(choices, rules, area, lambda1, lambda2)
 
         # Unit eigenvector of lambda1, without the cancellation in lambda1 - a.
         kind = choices[R.AXES]
@@ -167,7 +176,7 @@ def project(splats, lens, rules, choices, first, records, bounds, states):
             ex, ey = difference + spread, b
         else:
             ex, ey = b, spread - difference
-        norm = np.sqrt(ex * ex + ey * ey)
+        norm = _length(ex, ey)
         ex, ey = ex / norm, ey / norm
         axis1 = min(np.sqrt(two * lambda1), rules[R.AXIS_CAP])
         axis2 = min(np.sqrt(two * lambda2), rules[R.AXIS_CAP])
@@ -179,18 +188,8 @@ def project(splats, lens, rules, choices, first, records, bounds, states):
         red = max(splats[row, R.COLOR], rules[R.COLOR_FLOOR])
         green = max(splats[row, R.COLOR + 1], rules[R.COLOR_FLOOR])
         blue = max(splats[row, R.COLOR + 2], rules[R.COLOR_FLOOR])
-        if choices[R.HALF_RECORD]:
-            center_x = (f(round_to_half(ndc_x)) + one) * half * width
-            center_y = (f(round_to_half(ndc_y)) + one) * half * height
-            v1x, v1y = f(round_to_half(ex * axis1 / width)) * width, f(round_to_half(ey * axis1 / height)) * height
-            v2x, v2y = f(round_to_half(ey * axis2 / width)) * width, f(round_to_half(-ex * axis2 / height)) * height
-            area = v1x * v2y - v2x * v1y
-            ux, uy, vx, vy = v2y / area, -v2x / area, -v1y / area, v1x / area
-            red, green, blue = f(round_to_half(red)), f(round_to_half(green)), f(round_to_half(blue))
-            opacity = f(round_to_half(opacity))
-        else:
-            ux, uy = ex / axis1, ey / axis1
-            vx, vy = ey / axis2, -ex / axis2
+        ux, uy = ex / axis1, ey / axis1
+        vx, vy = ey / axis2, -ex / axis2
         if not opacity >= rules[R.ALPHA_FLOOR] or opacity == zero:
             continue
         if choices[R.GAMMA]:

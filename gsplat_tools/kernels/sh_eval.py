@@ -83,13 +83,14 @@ def evaluate_colors(sh0, shN, eye, degree, band_4_first, first, splats):
         green = f(sh0[i, 1]) * c0 + half
         blue = f(sh0[i, 2]) * c0 + half
         if num_rest > 0:
-            x = splats[row, R.MEAN] - eye[0]
-            y = splats[row, R.MEAN + 1] - eye[1]
-            z = splats[row, R.MEAN + 2] - eye[2]
+            # In float64, where the squares of float32 distances neither overflow nor vanish.
+            x = np.float64(splats[row, R.MEAN]) - np.float64(eye[0])
+            y = np.float64(splats[row, R.MEAN + 1]) - np.float64(eye[1])
+            z = np.float64(splats[row, R.MEAN + 2]) - np.float64(eye[2])
             length = np.sqrt(x * x + y * y + z * z)
             # A splat in the eye has no direction; it is seen along +z.
-            if length > f(0):
-                fill_basis(basis, x / length, y / length, z / length, degree, band_4_first)
+            if length > 0.0:
+                fill_basis(basis, f(x / length), f(y / length), f(z / length), degree, band_4_first)
             else:
                 fill_basis(basis, f(0), f(0), f(1), degree, band_4_first)
             for k in range(num_rest):

@@ -52,20 +52,20 @@ def project_scene(
         bounds=np.empty((count, 4), np.int32),
         states=np.empty(count, np.uint8),
     )
-    packs_anew = model.accumulator != "none"
-    # Accumulators hold splats relative to the camera.
-    lens = models.lens_array(model, camera, camera.position if packs_anew else cloud.origin, dtype)
+    # Splats become relative to the camera in float64: a scene far from zero is drawn like one about it.
+    lens = models.lens_array(model, camera, camera.position, dtype)
+    lens[[R.VIEW + 3, R.VIEW + 7, R.VIEW + 11]] = 0
     weights = np.empty(0, dtype) if state.weights is None else state.weights
-    eye = (camera.position - cloud.origin).astype(dtype)
+    eye, center = camera.position - cloud.origin, np.zeros(3, dtype)
     degree = min(cloud.sh_degree, model.max_sh_degree, cloud.sh_degree if sh_degree is None else sh_degree)
     band_4_first = dtype.type(model.band_4_first)
 
     def project_block(start: int, stop: int) -> None:
         splats = np.empty((stop - start, R.SPLAT_SIZE), dtype)
-        activate(means, cloud.log_scales, cloud.quats, cloud.opacity_logits, weights, start, stop, splats)
-        evaluate_colors(cloud.sh0, cloud.shN, eye, degree, band_4_first, start, splats)
-        if packs_anew:
-            requantize(splats, eye, PACKED if model.accumulator == "packed" else EXTENDED)
+        activate(means, eye, cloud.log_scales, cloud.quats, cloud.opacity_logits, weights, start, stop, splats)
+        evaluate_colors(cloud.sh0, cloud.shN, center, degree, band_4_first, start, splats)
+        if model.accumulator != "none":
+            requantize(splats, center, PACKED if model.accumulator == "packed" else EXTENDED)
         project(splats, lens, numbers, choices, start, projection.records, projection.bounds, projection.states)
 
     parallel.run_blocks(project_block, count)

@@ -155,10 +155,10 @@ def drawing_keys(
     from gsplat_tools.kernels.depth_keys import METRIC_DEPTH, METRIC_RADIAL, fill_depths
 
     means = state.means
-    view = view_rows(camera, state.cloud.origin, matrix).astype(means.dtype)
+    view = view_rows(camera, state.cloud.origin, matrix)
     depths = np.empty(len(means), np.float32)
     kind = METRIC_RADIAL if metric == "radial" else METRIC_DEPTH
-    sign = means.dtype.type(-1 if far_first and metric != "clip" else 1)
+    sign = -1.0 if far_first and metric != "clip" else 1.0
     parallel.run_blocks(lambda start, stop: fill_depths(means, view, kind, sign, start, stop, depths), len(means), _BLOCK_SIZE)
     keys = _clip_keys(depths, camera) if metric == "clip" else _sortable(depths, nan_last=True)
     if state.is_visible is not None:
