@@ -18,19 +18,18 @@ SLOPE_LIMIT = 1  # x/z and y/z are clamped to this many tan(fov / 2) in the Jaco
 CENTER_LIMIT = 2  # culled where abs(ndc) of the center is above
 AXIS_CAP = 3  # longest axis, px, as the square root of 2 lambda
 SMALLEST = 4  # culled where lambda1 is below, px^2
-OPACITY_CULL = 5  # culled where the opacity is below, before compensation
-ALPHA_CAP = 6
-ALPHA_FLOOR = 7  # fragments below are skipped
-CUTOFF = 8  # fragments beyond this q are skipped; q = d^2 / 2, d in standard deviations
-GAIN, OFFSET = 9, 10  # falloff = gain exp(-q) - offset
-EDGE_GAIN, EDGE_START, EDGE_SLOPE = 11, 12, 13  # less gain exp((m - start) slope), m = max(abs u, abs v) at the unit quad
-SCALE_FACTOR = 14  # of the quad
-COMPENSATION_FLOOR = 15  # least ratio of determinants under the root
-COLOR_FLOOR = 16
-BRIGHTNESS = 17
-STOP = 18  # a pixel is finished before its transmittance falls below
-ROUNDING = 19  # 1.5 * 2^(bits of the mantissa): adding and subtracting it rounds to an integer
-RULES_SIZE = 20
+ALPHA_CAP = 5
+ALPHA_FLOOR = 6  # fragments below are skipped
+CUTOFF = 7  # fragments beyond this q are skipped; q = d^2 / 2, d in standard deviations
+GAIN, OFFSET = 8, 9  # falloff = gain exp(-q) - offset
+EDGE_GAIN, EDGE_START, EDGE_SLOPE = 10, 11, 12  # less gain exp((m - start) slope), m = max(abs u, abs v) at the unit quad
+SCALE_FACTOR = 13  # of the quad
+COMPENSATION_FLOOR = 14  # least ratio of determinants under the root
+COLOR_FLOOR = 15
+BRIGHTNESS = 16
+STOP = 17  # a pixel is finished before its transmittance falls below
+ROUNDING = 18  # 1.5 * 2^(bits of the mantissa): adding and subtracting it rounds to an integer
+RULES_SIZE = 19
 
 # CHOICES: a model's alternatives
 COMPENSATION = 0
@@ -42,10 +41,9 @@ IS_FRONT_TO_BACK = 5
 IS_QUANTIZED = 6  # framebuffer of 8 bits
 SQUARE_PIXELS = 7  # the focal length of x serves both rows of the Jacobian
 CULLS_EXTENT = 8  # culled where abs(ndc) less the longest axis is above 1
-HALF_RECORD = 9  # projected splats are stored in half precision
-CHOICES_SIZE = 10
+CHOICES_SIZE = 9
 
-COMPENSATION_NONE, COMPENSATION_RATIO, COMPENSATION_VISIONARY = 0, 1, 2
+COMPENSATION_NONE, COMPENSATION_RATIO = 0, 1
 FOOTPRINT_ELLIPSE, FOOTPRINT_TILES = 0, 1
 AXES_EXACT, AXES_UNDEFINED, AXES_ALIGNED = 0, 1, 2
 """What happens where the eigenvector (b, lambda1 - a) degenerates: nothing, counted, or b below 0.001 counts as 0."""

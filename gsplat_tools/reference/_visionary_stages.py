@@ -136,14 +136,15 @@ def preprocess_scene(state: SceneState, camera: Camera, settings: Settings, dtyp
     from gsplat_tools.kernels import visionary as kernel
 
     cloud, matrix = state.cloud, settings.matrix
-    uniforms = _uniforms(cloud, camera, settings, dtype)
+    center = _center(cloud, camera, matrix)
+    uniforms = _uniforms(cloud, camera, settings, center, dtype)
     degree = min(cloud.sh_degree, visionary_buffers.MAX_SH_DEGREE if settings.sh_degree is None else settings.sh_degree)
-    eye = _eye(cloud, camera, matrix).astype(dtype)
+    eye = (_eye(cloud, camera, matrix) - center).astype(dtype)
 
     def preprocess_block(block: tuple[int, int]) -> tuple[NDArray[Any], NDArray[np.uint32], NDArray[np.uint8]]:
         part = slice(*block)
         weights = None if state.weights is None else state.weights[part]
-        splats = _decoded_splats(cloud.take(part), state.means[part], weights, eye, degree, settings)
+        splats = _decoded_splats(cloud.take(part), state.means[part], weights, center, eye, degree, settings)
         values = np.empty((len(splats), kernel.VALUES_SIZE), dtype)
         differences, states = np.empty(len(splats), dtype), np.empty(len(splats), np.uint8)
         kernel.preprocess(splats, uniforms, values, differences, states)
@@ -158,13 +159,25 @@ def preprocess_scene(state: SceneState, camera: Camera, settings: Settings, dtyp
     )
 
 
-def _uniforms(cloud: GaussianCloud, camera: Camera, settings: Settings, dtype: DTypeLike) -> NDArray[Any]:
+def _center(cloud: GaussianCloud, camera: Camera, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where the camera lies among the means: float32 keeps more of a scene far from zero once it is about there."""
+    position = camera.position - matrix[:3, :3] @ cloud.origin - matrix[:3, 3]
+    try:
+        center = np.linalg.solve(matrix[:3, :3], position)
+    except np.linalg.LinAlgError:
+        return np.zeros(3)
+    return center if np.isfinite(center).all() else np.zeros(3)
+
+
+def _uniforms(
+    cloud: GaussianCloud, camera: Camera, settings: Settings, center: NDArray[np.float64], dtype: DTypeLike
+) -> NDArray[Any]:
     """Return what the kernel reads about camera, model matrix and settings."""
     from gsplat_tools.kernels import visionary as kernel
 
     matrix = settings.matrix
     numbers = np.zeros(kernel.UNIFORMS_SIZE, np.float64)
-    numbers[kernel.VIEW : kernel.VIEW + 12] = view_rows(camera, cloud.origin, matrix)
+    numbers[kernel.VIEW : kernel.VIEW + 12] = view_rows(camera, cloud.origin + center, matrix)
     numbers[kernel.ROTATION : kernel.ROTATION + 9] = camera.viewmat[:3, :3].ravel()
     numbers[kernel.LINEAR : kernel.LINEAR + 9] = matrix[:3, :3].ravel()
     numbers[[kernel.FX, kernel.FY]] = camera.K[0, 0], camera.K[1, 1]
@@ -197,11 +210,12 @@ def _decoded_splats(
     part: GaussianCloud,
     means: NDArray[Any],
     weights: NDArray[Any] | None,
+    center: NDArray[np.float64],
     eye: NDArray[Any],
     degree: int,
     settings: Settings,
 ) -> NDArray[Any]:
-    """Return splats with covariances and colors as the shader reads them from buffers of the precision."""
+    """Return splats about a center with covariances and colors as the shader reads them from buffers of the precision."""
     from gsplat_tools.kernels import rules as R
     from gsplat_tools.kernels import visionary as kernel
     from gsplat_tools.kernels.sh_eval import BAND_4_FIRST, evaluate_colors
@@ -211,6 +225,7 @@ def _decoded_splats(
     # Overflow becomes infinity, which is counted as invalid.
     with np.errstate(over="ignore", invalid="ignore"):
         covariances = covariance_triangles(part.quats, part.log_scales, dtype=np.float32 if precision else dtype)
+    covariances[~part.quats.any(axis=1)] = np.nan
     opacities = sigmoid(part.opacity_logits.astype(np.float32 if precision else dtype, copy=False))
     if weights is not None:
         opacities = opacities * weights
@@ -218,7 +233,7 @@ def _decoded_splats(
         words = visionary_buffers.encode_gaussians(means, opacities, covariances, precision=precision)
         means, opacities, covariances = visionary_buffers.decode_gaussians(words, precision=precision)
     splats = np.empty((len(part), R.SPLAT_SIZE), dtype)
-    splats[:, R.MEAN : R.MEAN + 3] = means
+    splats[:, R.MEAN : R.MEAN + 3] = means - center
     splats[:, kernel.COVARIANCE : kernel.COVARIANCE + 6] = covariances
     splats[:, R.OPACITY] = opacities
     sh0, shN = part.sh0, part.shN[:, : (degree + 1) ** 2 - 1]

@@ -34,7 +34,8 @@ class Model:
     low_pass
         Added to both diagonals of the projected covariance, px^2.
     compensation
-        How the opacity makes up for the low-pass: "none", "ratio" (root of the ratio of determinants), "visionary".
+        How the opacity makes up for the low-pass: "none", "ratio" (root of the ratio of determinants), "visionary"
+        (its preprocess pass does).
     compensation_floor
         Least ratio under the root.
     z_min, z_max
@@ -50,8 +51,6 @@ class Model:
         min(1024, width, height).
     smallest
         Culled where the largest eigenvalue is below, px^2.
-    opacity_cull
-        Culled where the opacity is below, before compensation.
     alpha_cap, alpha_floor
         Alpha is at most the cap; fragments below the floor are skipped.
     cutoff
@@ -69,7 +68,7 @@ class Model:
     square_pixels
         Whether the horizontal focal length serves both rows of the Jacobian.
     half_records
-        Whether projected splats are stored in half precision.
+        Whether projected splats are stored in half precision; "visionary" only.
     color_floor
         Colors are clamped from below; None: not at all.
     band_4_first
@@ -98,7 +97,6 @@ class Model:
     culls_extent: bool = False
     axis_cap: float | Literal["viewport"] | None = None
     smallest: float = 0.0
-    opacity_cull: float = 0.0
     alpha_cap: float = math.inf
     alpha_floor: float = 1.0 / 255.0
     cutoff: float = math.inf
@@ -167,21 +165,17 @@ _SPARK = Model(
     accumulator="packed",
 )
 
+# Planes, culls and compensation are those of the preprocess pass, kernels/visionary.py.
 _VISIONARY = Model(
     name="visionary",
     variant="half",
     low_pass=0.1,
     compensation="visionary",
-    z_min=None,
-    center_limit=1.2,
-    opacity_cull=0.02,
     alpha_cap=0.99,
     alpha_floor=0.0,
     # Twice sqrt(ln 255): the shader compares a square with twice the root.
     cutoff=2.0 * math.sqrt(math.log(255.0)),
-    undefined_axes=True,
     half_records=True,
-    color_floor=0.0,
     max_sh_degree=3,
     metric="clip",
 )
@@ -256,7 +250,6 @@ def rule_array(model: Model, camera: Camera, dtype: DTypeLike, *, scale_factor: 
     # Quads reach to q = 4, which is twice sqrt(2 lambda).
     rules[R.AXIS_CAP] = cap / 2
     rules[R.SMALLEST] = model.smallest
-    rules[R.OPACITY_CULL] = model.opacity_cull
     rules[[R.ALPHA_CAP, R.ALPHA_FLOOR]] = model.alpha_cap, model.alpha_floor
     rules[R.CUTOFF] = model.cutoff
     rules[[R.GAIN, R.OFFSET]] = model.gain, model.offset
@@ -275,11 +268,7 @@ def choice_array(model: Model, *, scale_factor: float, gamma_to_linear: bool, qu
     from gsplat_tools.kernels import rules as R
 
     choices = np.zeros(R.CHOICES_SIZE, np.int64)
-    choices[R.COMPENSATION] = {
-        "none": R.COMPENSATION_NONE,
-        "ratio": R.COMPENSATION_RATIO,
-        "visionary": R.COMPENSATION_VISIONARY,
-    }[model.compensation]
+    choices[R.COMPENSATION] = R.COMPENSATION_RATIO if model.compensation == "ratio" else R.COMPENSATION_NONE
     choices[R.FOOTPRINT] = R.FOOTPRINT_TILES if model.tile_footprint else R.FOOTPRINT_ELLIPSE
     choices[R.AXES] = R.AXES_UNDEFINED if model.undefined_axes else R.AXES_ALIGNED if model.aligns_axes else R.AXES_EXACT
     # At scale factor 1 the quad cuts only what lies below the floor of alpha.
@@ -289,5 +278,4 @@ def choice_array(model: Model, *, scale_factor: float, gamma_to_linear: bool, qu
     choices[R.IS_QUANTIZED] = quantizes and not model.front_to_back
     choices[R.SQUARE_PIXELS] = model.square_pixels
     choices[R.CULLS_EXTENT] = model.culls_extent
-    choices[R.HALF_RECORD] = model.half_records
     return choices
