@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_tools.attributes.activations import logit, sigmoid
+from gsplat_tools.attributes.activations import mixed_logits, sigmoid
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.constants import VISIBLE_OPACITY
 from gsplat_tools.errors import CloudError
@@ -150,7 +150,7 @@ class GaussianSequence:
         first, second, fraction = self.bracket(t)
         cloud = self.frame(first)
         if interpolation == "linear" and fraction > 0 and second != first:
-            cloud = _interpolate(cloud, self.frame(second), np.float32(fraction))
+            cloud = _interpolate(cloud, self.frame(second), fraction)
         return _gate_opacity(cloud)
 
     def bounds(self) -> Bounds | None:
@@ -171,22 +171,26 @@ def _gate_opacity(cloud: GaussianCloud) -> GaussianCloud:
     return cloud.replace(opacity_logits=logits)
 
 
-def _interpolate(a: GaussianCloud, b: GaussianCloud, fraction: np.float32) -> GaussianCloud:
-    """Evaluate between two keyframes."""
-    keep = np.float32(1) - fraction
-    floor = np.float32(np.log(_MIN_SCALE))
-    log_scales = np.maximum(a.log_scales, floor) * keep + np.maximum(b.log_scales, floor) * fraction
-    flips = np.where(np.sum(a.quats * b.quats, axis=1, keepdims=True) < 0, np.float32(-1), np.float32(1))
-    quats = a.quats * keep + b.quats * flips * fraction
+def _interpolate(a: GaussianCloud, b: GaussianCloud, fraction: float) -> GaussianCloud:
+    """Evaluate between two keyframes: in float64, rounded once, so that what is equal in both stays as it is."""
+    first_logs, second_logs = (np.maximum(frame.log_scales.astype(np.float64), np.log(_MIN_SCALE)) for frame in (a, b))
+    quats, others = a.quats.astype(np.float64), b.quats.astype(np.float64)
+    flips = np.where(np.sum(quats * others, axis=1, keepdims=True) < 0, -1.0, 1.0)
+    quats = _mix(quats, others * flips, fraction)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     is_null = norms < _MIN_QUAT_NORM
-    quats = np.where(is_null, np.array([1, 0, 0, 0], np.float32), quats / np.where(is_null, 1, norms))
-    opacities = sigmoid(a.opacity_logits.astype(np.float64)) * keep + sigmoid(b.opacity_logits.astype(np.float64)) * fraction
+    quats = np.where(is_null, np.array([1.0, 0.0, 0.0, 0.0]), quats / np.where(is_null, 1.0, norms))
     return a.replace(
-        means=a.means * keep + b.means * fraction,
-        log_scales=log_scales,
-        quats=quats.astype(np.float32),
-        opacity_logits=logit(np.clip(opacities, 0.0, 1.0)),
-        sh0=a.sh0 * keep + b.sh0 * fraction,
-        shN=a.shN * keep + b.shN * fraction,
+        # The frames may have been recentered apart.
+        means=_mix(a.means.astype(np.float64), b.means + (b.origin - a.origin), fraction),
+        log_scales=_mix(first_logs, second_logs, fraction),
+        quats=quats,
+        opacity_logits=mixed_logits(a.opacity_logits, b.opacity_logits, fraction),
+        sh0=_mix(a.sh0.astype(np.float64), b.sh0.astype(np.float64), fraction),
+        shN=_mix(a.shN.astype(np.float64), b.shN.astype(np.float64), fraction),
     )
+
+
+def _mix(a: NDArray[np.float64], b: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
+    """Return a + (b - a) fraction, which keeps equal values as they are."""
+    return a + (b - a) * fraction

@@ -52,6 +52,53 @@ def logit(opacities: NDArray[Floating]) -> NDArray[Floating]:
         return (np.log(wide) - np.log1p(-wide)).astype(opacities.dtype)
 
 
+def mixed_logits(first: NDArray[Floating], second: NDArray[Floating], fraction: float) -> NDArray[Floating]:
+    """Return the logits of opacities between two: (1 - fraction) sigmoid(first) + fraction sigmoid(second).
+
+    Parameters
+    ----------
+    first, second
+        Logits of one shape and dtype; +-inf are legal.
+    fraction
+        Of the second, 0 to 1.
+
+    Returns
+    -------
+    NDArray
+        Same shape and dtype.
+
+    Notes
+    -----
+    What an opacity lacks to 1 is mixed like the opacity itself: 1 - o would be exactly 0 from logits of 37 on.
+    """
+    a, b = first.astype(np.float64), second.astype(np.float64)
+    opacities, rests = ((1 - fraction) * sigmoid(sign * a) + fraction * sigmoid(sign * b) for sign in (1.0, -1.0))
+    with np.errstate(divide="ignore"):
+        return (np.log(opacities) - np.log(rests)).astype(first.dtype)
+
+
+def weighted_logits(logits: NDArray[Floating], weights: NDArray[np.floating]) -> NDArray[Floating]:
+    """Return the logits of opacities times weights.
+
+    Parameters
+    ----------
+    logits
+        (N,) +-inf are legal.
+    weights
+        (N,) in [0, 1]; where they are exactly 1 the logits stay as they are.
+
+    Returns
+    -------
+    NDArray
+        Same shape and dtype as `logits`; -inf where the weight is 0.
+    """
+    wide, factors = logits.astype(np.float64), weights.astype(np.float64)
+    opacities = sigmoid(wide)
+    with np.errstate(divide="ignore"):
+        faded = np.log(opacities * factors) - np.log(sigmoid(-wide) + opacities * (1 - factors))
+    return np.where(factors == 1, wide, faded).astype(logits.dtype)
+
+
 def exp_scales(log_scales: NDArray[Floating]) -> NDArray[Floating]:
     """Return the scales of log scales.
 

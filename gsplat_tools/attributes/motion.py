@@ -30,7 +30,7 @@ def positions_at(
     Parameters
     ----------
     means, velocities
-        (N, 3), of one dtype, in which the result is computed.
+        (N, 3), of one dtype.
     times
         (N,).
     t
@@ -39,11 +39,12 @@ def positions_at(
     Returns
     -------
     NDArray
-        (N, 3); where velocity or time is not finite, so is the result.
+        (N, 3) of that dtype, computed in float64 and rounded once: where splats are fast, the rounding of t alone would move
+        them visibly in float32. Where velocity or time is not finite, neither is the result.
     """
     with np.errstate(invalid="ignore", over="ignore"):
-        age = means.dtype.type(t) - times
-        return np.asarray(means + velocities * age[:, None])
+        age = t - times.astype(np.float64)
+        return (means + velocities * age[:, None]).astype(means.dtype)
 
 
 def weights_at(
@@ -78,7 +79,8 @@ def weights_at(
             # Not age <= duration: the shaders compare t with the end of the window.
             weights = ((times <= moment) & (moment <= times + durations)).astype(times.dtype)
             return weights
-        weights = np.exp(times.dtype.type(-0.5) * np.square((moment - times) / durations)).astype(times.dtype)
+        # In float64: against a short duration the rounding of t is not small.
+        weights = np.exp(-0.5 * np.square((t - times.astype(np.float64)) / durations)).astype(times.dtype)
         weights[~(weights >= cutoff)] = 0
         return weights
 

@@ -33,6 +33,8 @@ C4 = (
     0.6258357354491761,
 )
 
+_UNIT_ROUNDING = 4 * 2.0**-52
+
 
 def num_bases(degree: int) -> int:
     """Return the number of basis functions up to a degree, (degree + 1)^2.
@@ -58,14 +60,14 @@ def evaluate_basis(directions: NDArray[np.floating], degree: int) -> NDArray[np.
     Parameters
     ----------
     directions
-        (N, 3) unit vectors, from the camera to the splat.
+        (N, 3) from the camera to the splat, of any length; zero is taken as +z, as renderers do.
     degree
         Highest band, 0 to 4.
 
     Returns
     -------
     NDArray
-        (N, (degree + 1)^2) float64.
+        (N, (degree + 1)^2) float64; NaN where a direction is not finite.
 
     Raises
     ------
@@ -77,7 +79,7 @@ def evaluate_basis(directions: NDArray[np.floating], degree: int) -> NDArray[np.
     Bands 0 to 3 with the signs of Kerbl et al. 2023; band 4 in the same convention (gsplat, SPZ).
     """
     basis = np.empty((len(directions), num_bases(degree)))
-    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    x, y, z = np.moveaxis(_unit_vectors(np.asarray(directions, np.float64)), -1, 0)
     basis[:, 0] = SH_C0
     if degree >= 1:
         basis[:, 1:4] = np.stack([-C1 * y, C1 * z, -C1 * x], axis=1)
@@ -112,6 +114,19 @@ def evaluate_basis(directions: NDArray[np.floating], degree: int) -> NDArray[np.
     return basis
 
 
+def _unit_vectors(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return directions of length 1, +z for zero; those that already are to the last place keep their bits."""
+    largest = np.abs(directions).max(axis=-1, keepdims=True, initial=0.0)
+    is_null = largest == 0
+    # By the largest component first, so that no square overflows or vanishes.
+    with np.errstate(invalid="ignore"):
+        scaled = directions / np.where(is_null, 1.0, largest)
+        lengths = np.sqrt((scaled * scaled).sum(axis=-1, keepdims=True))
+        units = scaled / np.where(is_null, 1.0, lengths)
+    is_unit = np.abs(lengths * largest - 1.0) <= _UNIT_ROUNDING
+    return np.where(is_null, np.array([0.0, 0.0, 1.0]), np.where(is_unit, directions, units))
+
+
 def evaluate_colors(
     sh0: NDArray[np.floating], shN: NDArray[np.floating], directions: NDArray[np.floating], *, degree: int | None = None
 ) -> NDArray[np.float64]:
@@ -124,7 +139,7 @@ def evaluate_colors(
     shN
         (N, K - 1, 3) higher terms, basis-major.
     directions
-        (N, 3) unit vectors, from the camera to the splat, in the frame of the cloud.
+        (N, 3) from the camera to the splat, in the frame of the cloud, of any length; zero is taken as +z.
     degree
         Highest band that is evaluated; by default all of them.
 

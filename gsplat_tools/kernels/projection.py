@@ -51,7 +51,7 @@ def _length(x, y):
     """Return the length of a vector whose squares may overflow or vanish."""
     largest = max(abs(x), abs(y))
     # Zero and infinity have no ratio to themselves.
-    if largest == 0.0 or largest == np.inf:
+    if not 0.0 < largest < np.inf:
         return largest
     x, y = x / largest, y / largest
     return largest * np.sqrt(x * x + y * y)

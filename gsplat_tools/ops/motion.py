@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_tools.attributes.activations import logit, sigmoid
+from gsplat_tools.attributes.activations import sigmoid, weighted_logits
 from gsplat_tools.attributes.motion import MIN_SIGMA, MotionBox, positions_at, weights_at
 from gsplat_tools.cloud import GaussianCloud, TimeModel
 from gsplat_tools.constants import VISIBLE_OPACITY
@@ -81,9 +81,8 @@ def at_time(cloud: GaussianCloud, t: float) -> GaussianCloud:
     if not np.isfinite(t):
         raise ValueError(f"time must be finite, got {t}")
     weights = _weights(cloud, t)
-    opacities = sigmoid(cloud.opacity_logits.astype(np.float64)) * weights
-    logits = np.where(weights == 1, cloud.opacity_logits, logit(opacities)).astype(np.float32)
-    logits[~(opacities >= SHOWN)] = -np.inf
+    logits = weighted_logits(cloud.opacity_logits, weights)
+    logits[~(sigmoid(cloud.opacity_logits.astype(np.float64)) * weights >= SHOWN)] = -np.inf
     means = cloud.means
     if cloud.velocities is not None and cloud.times is not None:
         means = positions_at(means, cloud.velocities, cloud.times, t)

@@ -103,6 +103,10 @@ def fit_motion(
     first of them (time 0 where there is none) to halfway to the frame after the last; frames between that do not show it
     count as residual. Gaussian: least squares of log opacity weighted by its square (Guo 2011). Opacity: the mean over
     the frames that show the splat, or the peak of the Gaussian; scale, rotation and SH: means weighted by opacity.
+
+    Source
+    ------
+    Welford 1962, Note on a method for calculating corrected sums of squares and products.
     """
     sums = _Sums(sequence.frame(0))
     times = sequence.frame_times
@@ -146,6 +150,7 @@ class _Sums:
         self._first = first
         self.visible = np.zeros(count, np.int64)
         self._from, self._to = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        # Running means, and sums of products of differences from them: sums of squares would cancel where times cluster.
         self._time, self._square = np.zeros(count), np.zeros(count)
         self._position, self._moment = np.zeros((count, 3)), np.zeros((count, 3))
         self._opacity = np.zeros(count)
@@ -162,10 +167,12 @@ class _Sums:
         self._from[rows[is_new]] = frame_id
         self._to[rows] = frame_id
         self.visible[rows] += 1
-        self._time[rows] += t
-        self._square[rows] += t * t
-        self._position[rows] += frame.means[rows]
-        self._moment[rows] += t * frame.means[rows].astype(np.float64)
+        later = t - self._time[rows]
+        self._time[rows] += later / self.visible[rows]
+        self._square[rows] += later * (t - self._time[rows])
+        farther = frame.means[rows] - self._position[rows]
+        self._position[rows] += farther / self.visible[rows][:, None]
+        self._moment[rows] += (t - self._time[rows])[:, None] * farther
         self._opacity[rows] += shown
         for power in range(5):
             self._powers[power, rows] += shown**2 * (t - 0.5) ** power
@@ -188,10 +195,8 @@ class _Sums:
         if time_model == "gaussian":
             times, durations, opacities = self._gaussians(splats, starts, ends, opacities)
         moments = times.astype(np.float32)
-        middle = self._time[splats] / count
-        center = self._position[splats] / count[:, None]
-        spread = self._square[splats] - count * middle**2
-        covariance = self._moment[splats] - (count * middle)[:, None] * center
+        middle, center = self._time[splats], self._position[splats]
+        spread, covariance = self._square[splats], self._moment[splats]
         moves = spread > 1e-12 * count
         velocities = np.where(moves[:, None], covariance / np.where(moves, spread, 1.0)[:, None], 0.0).astype(np.float32)
         share = weight[:, None]
