@@ -28,6 +28,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+_MAX_MESSAGE, _MAX_FIELD = 1000, 200
+"""Characters of a message and of a field that are kept: both may hold names from a hostile file."""
+
 
 class GsplatError(Exception):
     """Base of every error that this package raises about data.
@@ -55,11 +58,12 @@ class GsplatError(Exception):
         field: str | None = None,
         frame: int | None = None,
     ) -> None:
+        message = quoted(message, _MAX_MESSAGE)
         super().__init__(message)
         self.message = message
         self.path = None if path is None else Path(path)
         self.offset = offset
-        self.field = field
+        self.field = None if field is None else quoted(field, _MAX_FIELD)
         self.frame = frame
 
     def __str__(self) -> str:
@@ -139,7 +143,7 @@ class GsplatWarning(UserWarning):
     code = "warning"
 
     def __init__(self, message: str, *, code: str | None = None) -> None:
-        super().__init__(message)
+        super().__init__(quoted(message, _MAX_MESSAGE))
         if code is not None:
             self.code = code
 
@@ -154,6 +158,23 @@ class NonFiniteWarning(GsplatWarning):
     """Values that are not finite were found; the splats that hold them were dropped."""
 
     code = "non-finite"
+
+
+def quoted(text: str, limit: int | None = None) -> str:
+    """Return a text that may hold names from a file so that a terminal can show it: no control characters, no end of it.
+
+    Parameters
+    ----------
+    text
+        To show; line breaks stay.
+    limit
+        Most characters; what is in the middle of more is left out.
+    """
+    if limit is not None and len(text) > limit:
+        text = f"{text[: limit // 2]} ... {text[-limit // 4 :]}"
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def counts_in_words(counts: Mapping[str, int]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import warnings
 import zipfile
 from collections.abc import Callable
 from typing import Any
@@ -222,16 +223,17 @@ def _too_small() -> bytes:
     return archive(meta, valid_files())
 
 
-def _duplicate() -> bytes:
-    target = io.BytesIO(archive(valid_meta(), valid_files()))
-    with zipfile.ZipFile(target, "a") as bundle:
-        info = zipfile.ZipInfo("meta.json")
-        import warnings
+def _added(name: str, data: str) -> Callable[[], bytes]:
+    """A sound bundle with one more entry."""
 
-        with warnings.catch_warnings():
+    def build() -> bytes:
+        target = io.BytesIO(archive(valid_meta(), valid_files()))
+        with zipfile.ZipFile(target, "a") as bundle, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            bundle.writestr(info, json.dumps(valid_meta()))
-    return target.getvalue()
+            bundle.writestr(zipfile.ZipInfo(name), data)
+        return target.getvalue()
+
+    return build
 
 
 _SEGMENTS = "streams/sh/shNDeltaSegments"
@@ -244,7 +246,9 @@ BROKEN: dict[str, Callable[[], bytes]] = {
     "zip-overlap": _overlapping,
     "zip-entry-corrupt": _corrupt_entry,
     "zip-bad-name": _with_file("../outside.bin", b"1"),
-    "zip-duplicate": _duplicate,
+    "zip-duplicate": _added("sh/centroids.bin", "x"),
+    "zip-repeated": _added("meta.json", json.dumps(valid_meta())),
+    "zip-entry-size": _with_file("sh/centroids.bin", bytes(2 * 27 * 4 + 1)),
     "meta-missing": _raw_meta(None),
     "meta-encoding": _raw_meta(b'{"format": "\xff"}'),
     "meta-json": _raw_meta(b"{"),

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import click
 
-from gsplat_tools.errors import GsplatError, GsplatWarning
+from gsplat_tools.errors import GsplatError, GsplatWarning, quoted
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -23,8 +23,8 @@ EXIT_INTERRUPTED = 130
 
 
 def one_line(text: object) -> str:
-    """Return a text without line breaks."""
-    return " ".join(str(text).split())
+    """Return a text without line breaks and control characters."""
+    return quoted(" ".join(str(text).split()))
 
 
 def _end_cleanly_on_signals() -> None:

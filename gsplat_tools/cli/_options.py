@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gsplat_tools.attributes.coordinate_systems import is_known
+from gsplat_tools.formats._limits import use_max_memory
 from gsplat_tools.formats.registry import FORMATS
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -26,8 +27,9 @@ if TYPE_CHECKING:
     TimesBase = click.ParamType[list[float]]
     AxesBase = click.ParamType[str]
     FloatBase = click.ParamType[float]
+    BytesBase = click.ParamType[int]
 else:
-    SizeBase = DegreeBase = TimesBase = AxesBase = FloatBase = click.ParamType
+    SizeBase = DegreeBase = TimesBase = AxesBase = FloatBase = BytesBase = click.ParamType
 
 
 class AxesType(AxesBase):
@@ -121,6 +123,20 @@ class FramesType(click.ParamType[int | str]):
         return int(value)
 
 
+class BytesType(BytesBase):
+    """A number of bytes, with or without a unit."""
+
+    name = "SIZE"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the bytes."""
+        match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,6})?) ?(?:([KMGT])(?:i?B)?|B)?", str(value).strip(), re.IGNORECASE)
+        size = 0 if match is None else int(float(match[1]) * 1024 ** " KMGT".index((match[2] or " ").upper()))
+        if size < 1:
+            self.fail(f"{value!r} is not a size such as 512M or 4G", param, ctx)
+        return size
+
+
 class FrameTimesType(TimesBase):
     """A comma-separated list, or a file of one number a line."""
 
@@ -159,6 +175,22 @@ def jobs_option(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("--jobs", type=click.IntRange(min=1), help="Threads to use; the result does not depend on it.")(
         function
     )
+
+
+def max_memory_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --max-memory, which holds until the command ends."""
+
+    def limit(ctx: click.Context, _param: click.Parameter, value: int | None) -> None:
+        if value is not None:
+            ctx.with_resource(use_max_memory(value))
+
+    return click.option(
+        "--max-memory",
+        type=BytesType(),
+        expose_value=False,
+        callback=limit,
+        help="Most bytes that the splats of a source may take, such as 4G; by default 1024 times its file.",
+    )(function)
 
 
 def version_option(function: Callable[..., Any]) -> Callable[..., Any]:

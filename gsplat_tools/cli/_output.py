@@ -17,7 +17,18 @@ from gsplat_tools.progress import Stage, report_to
 
 def print_json(value: Any) -> None:
     """Print one JSON object on stdout; numbers that are not finite become null."""
-    click.echo(json.dumps(finite(value), indent=2, ensure_ascii=False, allow_nan=False))
+    text = json.dumps(finite(value), indent=2, ensure_ascii=False, allow_nan=False)
+    # Half of a surrogate pair, which a name in a file may hold, has no UTF-8.
+    click.echo(text if text.isascii() or _has_utf8(text) else json.dumps(finite(value), indent=2, allow_nan=False))
+
+
+def _has_utf8(text: str) -> bool:
+    """Whether a text can be encoded."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def finite(value: Any) -> Any:

@@ -27,6 +27,7 @@ from gsplat_tools.cli._errors import reports_errors
 @click.option("--model", type=click.Choice(options.MODELS), help="Rendering model; by default that of each format.")
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
 @options.jobs_option
+@options.max_memory_option
 @options.json_option
 @options.progress_option
 @reports_errors

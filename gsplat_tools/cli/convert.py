@@ -156,6 +156,7 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 @click.option("--views", type=click.IntRange(min=0), default=2, show_default=True, help="Views to render when validating.")
 @click.option("--model", type=click.Choice(options.MODELS), help="Rendering model to validate with; by default the target's.")
 @options.jobs_option
+@options.max_memory_option
 @click.option("--overwrite", is_flag=True, help="Replace a target that is there.")
 @options.json_option
 @click.option("--quiet", is_flag=True, help="Print errors only.")

@@ -42,6 +42,7 @@ def main() -> None:
 
 @main.command()
 @click.argument("file", type=options.EXISTING_FILE)
+@options.max_memory_option
 @options.json_option
 @reports_errors
 def info(file: Path, *, as_json: bool) -> None:
@@ -53,7 +54,7 @@ def info(file: Path, *, as_json: bool) -> None:
         output.print_json(facts)
         return
     for name, value in facts.items():
-        click.echo(f"{name:18}{_plain(value)}")
+        click.echo(f"{name:18}{one_line(_plain(value))}")
 
 
 def _plain(value: Any) -> str:
@@ -78,6 +79,7 @@ def _plain(value: Any) -> str:
 @main.command()
 @click.argument("file", type=options.EXISTING_FILE)
 @click.option("--frame", type=click.IntRange(min=0), default=0, show_default=True, help="Frame of a sequence.")
+@options.max_memory_option
 @options.json_option
 @reports_errors
 def stats(file: Path, *, frame: int, as_json: bool) -> None:
@@ -119,6 +121,7 @@ def stats(file: Path, *, frame: int, as_json: bool) -> None:
     help="Write source, candidate and amplified difference of every view.",
 )
 @options.jobs_option
+@options.max_memory_option
 @options.json_option
 @options.progress_option
 @reports_errors
@@ -213,6 +216,7 @@ def compare(
 )
 @click.option("--overwrite", is_flag=True, help="Replace a picture that is there.")
 @options.jobs_option
+@options.max_memory_option
 @options.json_option
 @options.progress_option
 @reports_errors
@@ -242,6 +246,7 @@ def render(file: Path, *, target: Path | None, jobs: int | None, as_json: bool, 
 @click.option(
     "--max-issues", type=click.IntRange(min=1), default=100, show_default=True, help="Most codes to list, errors first."
 )
+@options.max_memory_option
 @options.json_option
 @options.progress_option
 @reports_errors
@@ -271,6 +276,7 @@ def validate(file: Path, *, max_issues: int, as_json: bool, progress: bool) -> N
 @click.argument("file", type=options.EXISTING_FILE)
 @click.option("-o", "--output", "target", type=click.Path(dir_okay=False, path_type=Path), help="File to write instead.")
 @click.option("--overwrite", is_flag=True, help="Replace the output if it is there.")
+@options.max_memory_option
 @reports_errors
 def normalize(file: Path, *, target: Path | None, overwrite: bool) -> None:
     """Repair the meta.json of old .sog4d bundles, in place or into a new file."""

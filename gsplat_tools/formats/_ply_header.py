@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
@@ -45,7 +46,7 @@ class PlyProperty:
     count_dtype: np.dtype[Any] | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PlyElement:
     """An element as the header declares it.
 
@@ -62,17 +63,22 @@ class PlyElement:
     properties: tuple[PlyProperty, ...]
     line_offset: int
 
-    @property
+    @cached_property
+    def by_name(self) -> dict[str, PlyProperty]:
+        """The properties by name."""
+        return {prop.name: prop for prop in self.properties}
+
+    @cached_property
     def has_lists(self) -> bool:
         """Whether rows differ in length."""
         return any(prop.count_dtype is not None for prop in self.properties)
 
-    @property
+    @cached_property
     def min_row_bytes(self) -> int:
         """Bytes of a binary row, with every list empty."""
         return sum((prop.count_dtype or prop.dtype).itemsize for prop in self.properties)
 
-    @property
+    @cached_property
     def row_dtype(self) -> np.dtype[Any]:
         """Packed record of a binary row; only without lists."""
         return np.dtype([(prop.name, prop.dtype) for prop in self.properties])
@@ -174,7 +180,7 @@ def _read_raw_header(stream: BinaryIO) -> bytes:
         head += part
         start = re.match(rb"ply[ \t]*(\r\n|\n|\r(?!\n))", head)
         if start is None:
-            if b"ply\r\n".startswith(head.rstrip(b" \t")):  # so far, so good
+            if len(head) < MAX_HEADER_BYTES and b"ply\r\n".startswith(head.rstrip(b" \t")):  # so far, so good
                 if part:
                     continue
                 where = f"the file ends after {len(head)} bytes, inside the PLY header" if head else "the file is empty"

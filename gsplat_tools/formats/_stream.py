@@ -1,15 +1,12 @@
-"""Reading what a header promises, and no more: exact reads, claims held against the bytes that are there."""
+"""Reading what a header promises, and no more."""
 
 from __future__ import annotations
 
 import io
 from typing import BinaryIO, cast
 
-from gsplat_tools.errors import LimitExceededError, TruncatedDataError
+from gsplat_tools.errors import TruncatedDataError
 from gsplat_tools.formats._files import spooled
-
-MAX_EXPANSION = 1024
-"""A header that claims more than this many times its file's size is refused before anything is allocated."""
 
 _SPOOL_BYTES = 16 << 20
 
@@ -62,19 +59,3 @@ def stream_size(stream: BinaryIO) -> int:
 def seekable(stream: BinaryIO) -> BinaryIO:
     """Return the stream, or a temporary copy of what is left of it where it cannot seek (pipes)."""
     return stream if stream.seekable() else spooled(stream, _SPOOL_BYTES)
-
-
-def check_claim(claimed: int, available: int, *, field: str, offset: int | None = None) -> None:
-    """Refuse a decoded size that no honest file of `available` bytes would claim.
-
-    Raises
-    ------
-    LimitExceededError
-        `claimed` bytes are more than MAX_EXPANSION times `available`.
-    """
-    if claimed > available * MAX_EXPANSION:
-        raise LimitExceededError(
-            f"the header claims {claimed} bytes of data in a file of {available} bytes, more than {MAX_EXPANSION} times",
-            field=field,
-            offset=offset,
-        )

@@ -103,6 +103,11 @@ def parse_header(data: bytes, *, field: str, frame: int | None = None) -> WebpHe
     raise CorruptDataError(f"expected a WebP image, found a chunk {kind!r} without a size", field=field, frame=frame)
 
 
+def most_bytes(width: int, height: int) -> int:
+    """Return more than any encoder makes of an image: its bytes, and room for headers and metadata."""
+    return 8 * width * height + (1 << 20)
+
+
 def decode_rgba(data: bytes, width: int, height: int, *, field: str, frame: int | None = None) -> Image:
     """Decode a lossless WebP file of a known size.
 
@@ -147,6 +152,12 @@ def decode_rgba(data: bytes, width: int, height: int, *, field: str, frame: int 
             pixels = np.asarray(opened.convert("RGBA"))
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise CorruptDataError(f"the WebP image does not decompress ({error})", field=field, frame=frame) from error
+    if pixels.shape != (height, width, 4):
+        raise CorruptDataError(
+            f"expected an image of {width} x {height} pixels, found {pixels.shape[1]} x {pixels.shape[0]} behind the header",
+            field=field,
+            frame=frame,
+        )
     return cast("Image", pixels)
 
 

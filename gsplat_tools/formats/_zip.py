@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
-from itertools import pairwise
+from collections.abc import Collection, Iterator
 from typing import BinaryIO, Literal
 
 from gsplat_tools.errors import CorruptDataError, LimitExceededError
 from gsplat_tools.formats._issues import Issue, Rule, raise_errors, refuse
-from gsplat_tools.formats._stream import MAX_EXPANSION
+from gsplat_tools.formats._limits import MAX_EXPANSION, max_memory
 
 Compression = Literal["stored", "deflated"]
 
@@ -19,20 +19,28 @@ MAX_ENTRIES = 1 << 22
 
 _FIXED_TIME = (1980, 1, 1, 0, 0, 0)
 _SLACK_BYTES = 1 << 16
+_LOCAL_HEADER = 30
 
 RULES: dict[str, Rule] = {
     "zip-invalid": Rule(severity="error", meaning="The file is a ZIP archive that can be opened."),
     "zip-too-many-entries": Rule(
         severity="error", meaning=f"The archive has at most {MAX_ENTRIES} entries.", error=LimitExceededError
     ),
-    "zip-bad-name": Rule(severity="warning", meaning="Entry names are relative, with / between parts, without . or .."),
-    "zip-duplicate": Rule(severity="warning", meaning="Entry names are unique; of equal names the last entry counts."),
+    "zip-bad-name": Rule(severity="error", meaning="Entry names are relative, with / between parts, without . or .."),
+    "zip-duplicate": Rule(severity="error", meaning="Entry names are unique: readers would take different ones for the file."),
+    "zip-repeated": Rule(
+        severity="warning",
+        meaning="meta.json occurs once; other tools add a second one when they repair it, and the last counts.",
+    ),
     "zip-encrypted": Rule(severity="error", meaning="Entries are not encrypted."),
     "zip-method": Rule(severity="error", meaning="Entries are stored or deflated."),
     "zip-ratio": Rule(
         severity="error",
-        meaning=f"No entry claims more than {MAX_EXPANSION} times its compressed size.",
+        meaning=f"No entry claims more than {MAX_EXPANSION} times its compressed size, or --max-memory.",
         error=LimitExceededError,
+    ),
+    "zip-entry-size": Rule(
+        severity="error", meaning="No entry is larger than what it holds can need.", error=LimitExceededError
     ),
     "zip-overlap": Rule(severity="error", meaning="No two entries share bytes of the archive."),
     "zip-entry-corrupt": Rule(severity="error", meaning="Every entry that is read decompresses and matches its CRC."),
@@ -48,6 +56,8 @@ class ZipReader:
         Can seek; stays open as long as entries are read. Reads from several threads are safe.
     refuses
         Whether to raise the first error of the directory; else `issues` holds them all.
+    repeatable
+        Names that may occur again; the last entry counts.
 
     Raises
     ------
@@ -55,14 +65,14 @@ class ZipReader:
         The stream is no archive, or breaks a rule of `RULES`.
     """
 
-    def __init__(self, stream: BinaryIO, *, refuses: bool = True) -> None:
+    def __init__(self, stream: BinaryIO, *, refuses: bool = True, repeatable: Collection[str] = ()) -> None:
         stream.seek(0)
         try:
             self._archive = zipfile.ZipFile(stream)
-        except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError, OverflowError) as error:
-            message = f"expected a ZIP archive, found none that can be opened ({error})"
-            raise refuse(Issue(code="zip-invalid", message=message), RULES) from error
-        issues = list(check_directory(self._archive.infolist()))
+        except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError, OverflowError, struct.error) as error:
+            message = f"expected a ZIP archive, found none that can be opened ({error}); copy or download the file again"
+            raise refuse(Issue(code="zip-invalid", message=message, field="archive", offset=0), RULES) from error
+        issues = list(check_directory(self._archive.infolist(), self._archive.start_dir, repeatable))
         self.issues = raise_errors(issues, RULES) if refuses else issues
         self._last = {info.filename: info for info in self._archive.infolist()}
 
@@ -86,26 +96,55 @@ class ZipReader:
         """Return how an entry is compressed."""
         return "stored" if self._last[name].compress_type == zipfile.ZIP_STORED else "deflated"
 
-    def read(self, name: str, *, frame: int | None = None) -> bytes:
+    def read(self, name: str, *, frame: int | None = None, at_most: int | None = None) -> bytes:
         """Return the bytes of the last entry of that name.
+
+        Parameters
+        ----------
+        name, frame
+            The entry, and the frame that errors name.
+        at_most
+            Bytes that what it holds can need; entries that claim more are not read.
 
         Raises
         ------
         CorruptDataError
             There is no such entry, or it does not decompress to what its record says.
+        LimitExceededError
+            It claims more than `at_most` bytes.
         """
         info = self._last.get(name)
         if info is None:
             raise CorruptDataError("the archive has no such entry", field=name, frame=frame)
+        if at_most is not None and info.file_size > at_most:
+            message = f"expected at most {at_most} bytes, the entry claims {info.file_size}"
+            raise refuse(Issue(code="zip-entry-size", message=message, field=name, frame=frame), RULES)
         try:
-            return self._archive.read(info)
+            # Never more than the record says, whatever the compressed bytes hold; the end is where the CRC is checked.
+            with self._archive.open(info) as entry:
+                data = entry.read(info.file_size)
+                entry.read(1)
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError, RuntimeError) as error:
             issue = Issue(code="zip-entry-corrupt", message=f"the entry does not decompress ({error})", field=name, frame=frame)
             raise refuse(issue, RULES) from error
+        if len(data) != info.file_size:
+            message = f"the entry holds {len(data)} bytes, its record says {info.file_size}"
+            raise refuse(Issue(code="zip-entry-corrupt", message=message, field=name, frame=frame), RULES)
+        return data
 
 
-def check_directory(entries: list[zipfile.ZipInfo]) -> Iterator[Issue]:
-    """Yield what is wrong with the directory of an archive."""
+def check_directory(entries: list[zipfile.ZipInfo], directory_offset: int, repeatable: Collection[str] = ()) -> Iterator[Issue]:
+    """Yield what is wrong with the directory of an archive.
+
+    Parameters
+    ----------
+    entries
+        Its records.
+    directory_offset
+        Where it starts, which is where the last entry has to end.
+    repeatable
+        Names that may occur again.
+    """
     if len(entries) > MAX_ENTRIES:
         yield Issue(
             code="zip-too-many-entries",
@@ -117,9 +156,10 @@ def check_directory(entries: list[zipfile.ZipInfo]) -> Iterator[Issue]:
     for info in entries:
         name = info.filename
         if not is_relative_name(name.removesuffix("/")):
-            yield Issue(code="zip-bad-name", message=f"expected a relative name, found {name!r}; it is ignored", field=name)
+            yield Issue(code="zip-bad-name", message=f"expected a relative name, found {name!r}"[:200], field=name)
         if name in seen:
-            yield Issue(code="zip-duplicate", message="the name occurs again; the last entry counts", field=name)
+            code = "zip-repeated" if name in repeatable else "zip-duplicate"
+            yield Issue(code=code, message="the name occurs again; the last entry counts", field=name)
         seen.add(name)
         if info.flag_bits & 0x41:
             yield Issue(code="zip-encrypted", message="the entry is encrypted; decrypt the archive first", field=name)
@@ -130,21 +170,25 @@ def check_directory(entries: list[zipfile.ZipInfo]) -> Iterator[Issue]:
                 field=name,
                 value=info.compress_type,
             )
-        if info.file_size > info.compress_size * MAX_EXPANSION + _SLACK_BYTES:
+        limit = max_memory()
+        if info.file_size > (info.compress_size * MAX_EXPANSION + _SLACK_BYTES if limit is None else limit):
             yield Issue(
                 code="zip-ratio",
-                message=f"the entry claims {info.file_size} bytes from {info.compress_size}, more than {MAX_EXPANSION} times",
+                message=f"the entry claims {info.file_size} bytes from {info.compress_size}, more than is allowed; "
+                "if you trust the file, allow it with --max-memory (library: use_max_memory)",
                 field=name,
                 value=info.file_size,
             )
     ordered = sorted(entries, key=lambda info: (info.header_offset, info.compress_size))
-    for before, after in pairwise(ordered):
-        if before.header_offset + 30 + before.compress_size > after.header_offset:
+    places = [(info.header_offset, repr(info.filename)) for info in ordered] + [(directory_offset, "the directory")]
+    for before, (start, name) in zip(ordered, places[1:], strict=True):
+        # The local header may be longer than this by its extra field, which zipfile looks at when it opens the entry.
+        if before.header_offset + _LOCAL_HEADER + before.compress_size > start:
             yield Issue(
                 code="zip-overlap",
-                message=f"the entry shares bytes with {after.filename!r}",
+                message=f"the entry shares bytes with {name}"[:200],
                 field=before.filename,
-                offset=before.header_offset,
+                offset=max(before.header_offset, 0),
             )
 
 
@@ -176,3 +220,9 @@ class ZipWriter:
     def close(self) -> None:
         """Write the directory."""
         self._archive.close()
+
+    def __enter__(self) -> ZipWriter:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()

@@ -26,6 +26,7 @@ from gsplat_tools.cloud import GaussianCloud, empty_cloud
 from gsplat_tools.codecs.smallest_three import Rotation
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning, TruncatedDataError
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, Scene
 from gsplat_tools.formats.knobs import Knob, general_knobs
@@ -75,6 +76,7 @@ def _count(stream: BinaryIO) -> int:
             f"expected records of {RECORD.itemsize} bytes, at least one, found {size} bytes",
             offset=size - size % RECORD.itemsize,
         )
+    check_splats(size // RECORD.itemsize, 0, None, field="records")
     return size // RECORD.itemsize
 
 

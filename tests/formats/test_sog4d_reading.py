@@ -137,7 +137,7 @@ def test_legacy_vectors__are_read_with_a_warning() -> None:
     assert np.array_equal(sequence.frame(1).means, opened(valid_bundle()).frame(1).means)
 
 
-def test_duplicate_name__is_read_as_the_last_entry() -> None:
+def test_second_meta_json__counts() -> None:
     changed: Any = valid_meta()
     changed["streams"]["position"]["rangeMax"][0]["x"] = 11
     target = io.BytesIO(archive(valid_meta(), valid_files()))

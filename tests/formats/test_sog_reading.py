@@ -181,7 +181,7 @@ def test_meta__names_the_field_that_is_wrong(path: str, value: Any) -> None:
     [
         ("count", 7, "image-size"),
         ("count", 2.5, "count"),
-        ("count", 10**12, "image-size"),
+        ("count", 10**12, "image-limit"),
         ("means.mins", [2, 0, -2], "range"),
         ("means.maxs", [1, 3, 89], "range"),
         ("scales.codebook", [0.0] * 257, "codebook-length"),

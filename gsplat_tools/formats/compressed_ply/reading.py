@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gsplat_tools.chunks import CHUNK_SIZE, CloudChunks
 from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud, empty_cloud
 from gsplat_tools.errors import CorruptDataError, LossyConversionWarning, UnsupportedVersionError
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._ply_comments import SplatComments, splat_comments
 from gsplat_tools.formats._ply_header import PlyElement, PlyHeader, element_offsets, read_header
 from gsplat_tools.formats._stream import read_exactly
@@ -111,6 +112,7 @@ def open_packed(stream: BinaryIO) -> PackedPly:
             )
         degree = counts.index(number)
     comments = splat_comments(header, is_flat=False)
+    check_splats(vertex.count, degree, None, field="vertex", offset=vertex.line_offset)
     return PackedPly(header, comments, chunk, vertex, sh, element_offsets(header, stream), degree)
 
 

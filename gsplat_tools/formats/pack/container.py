@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 import zlib
@@ -16,7 +15,9 @@ import zstandard
 from numpy.typing import NDArray
 
 from gsplat_tools.errors import CorruptDataError, LimitExceededError, TruncatedDataError, UnsupportedVersionError
-from gsplat_tools.formats._stream import check_claim, read_exactly, stream_size
+from gsplat_tools.formats import _json
+from gsplat_tools.formats._limits import check_claim
+from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.pack.json_fields import whole
 
 MAGIC = b"GSPK"
@@ -25,7 +26,6 @@ LAYOUTS = ("spark", "uncompressed")
 """Layouts by the number that the header holds."""
 
 ALIGNMENT = 64
-MAX_JSON_BYTES = 64 << 20
 
 HEADER = struct.Struct("<4sIQQQII24s")
 assert HEADER.size == ALIGNMENT
@@ -138,12 +138,12 @@ def parse(stream: BinaryIO, layouts_of: Callable[[Mapping[str, Any]], Sequence[S
         raise CorruptDataError(f"the header says {length} bytes but the file has {size}", field="file_length", offset=8)
     if any(reserved):
         raise CorruptDataError("expected zeros; a later version may use them", field="reserved", offset=40)
-    if json_offset < HEADER.size or json_length > size - min(json_offset, size):
+    if not HEADER.size <= json_offset <= size or json_length > size - min(json_offset, size):
         raise CorruptDataError(
             f"{json_length} bytes at {json_offset} are not in a file of {size}", field="json_offset", offset=16
         )
-    if json_length > MAX_JSON_BYTES:
-        raise LimitExceededError(f"{json_length} bytes are more than {MAX_JSON_BYTES}", field="json_length", offset=24)
+    if json_length > _json.MAX_BYTES:
+        raise LimitExceededError(f"{json_length} bytes are more than {_json.MAX_BYTES}", field="json_length", offset=24)
     stream.seek(json_offset)
     text = read_exactly(stream, json_length, field="description")
     if zlib.crc32(text) != checksum:
@@ -151,7 +151,9 @@ def parse(stream: BinaryIO, layouts_of: Callable[[Mapping[str, Any]], Sequence[S
     description = _parse_json(text, json_offset)
     if layout >= len(LAYOUTS) or description.get("layout") != LAYOUTS[layout]:
         raise CorruptDataError(
-            f"the header says layout {layout}, the description {description.get('layout')!r}", field="layout", offset=36
+            f"the header says layout {layout}, the description {_json.shown(description.get('layout'))}",
+            field="layout",
+            offset=36,
         )
     count = whole(description, "count")
     frame_rows = whole(description, "frame_rows", low=1)
@@ -167,10 +169,10 @@ def _parse_json(text: bytes, offset: int) -> dict[str, Any]:
         raise CorruptDataError(f"{name} is not a JSON number", field="description", offset=offset)
 
     try:
-        description = json.loads(text, parse_constant=refuse)
+        description = _json.parse(text, parse_constant=refuse)
     except CorruptDataError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise CorruptDataError(f"not JSON: {error}", field="description", offset=offset) from error
     if not isinstance(description, dict):
         raise CorruptDataError(f"expected an object, found {type(description).__name__}", field="description", offset=offset)
@@ -188,7 +190,7 @@ def _check_streams(
     for entry in entries:
         name = entry.get("name")
         if not isinstance(name, str) or name in by_name:
-            raise CorruptDataError(f"expected a name of its own, found {name!r}"[:200], field="streams")
+            raise CorruptDataError(f"expected a name of its own, found {_json.shown(name)}", field="streams")
         by_name[name] = entry
     check_claim(sum(count * layout.row_bytes for layout in layouts), size, field="count")
     streams = {}
@@ -208,10 +210,10 @@ def _check_stream(entry: Mapping[str, Any], layout: StreamLayout, count: int, fr
         ("raw_length", count * layout.row_bytes),
     ):
         if entry.get(key) != expected:
-            raise CorruptDataError(f"expected {expected!r}, found {entry.get(key)!r}"[:200], field=f"{where}{key}")
+            raise CorruptDataError(f"expected {expected!r}, found {_json.shown(entry.get(key))}", field=f"{where}{key}")
     codec = entry.get("codec")
     if codec not in ("zstd", "none"):
-        raise CorruptDataError(f"expected 'zstd' or 'none', found {codec!r}"[:200], field=f"{where}codec")
+        raise CorruptDataError(f"expected 'zstd' or 'none', found {_json.shown(codec)}", field=f"{where}codec")
     offset = whole(entry, "offset", low=ALIGNMENT, where=where)
     stored = whole(entry, "stored_length", where=where)
     if offset % ALIGNMENT:
@@ -225,7 +227,7 @@ def _check_stream(entry: Mapping[str, Any], layout: StreamLayout, count: int, fr
             raise CorruptDataError(f"expected {num_frames} numbers, one a frame", field=f"{where}{key}")
         for value in values:
             if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= size + (1 << 32):
-                raise CorruptDataError(f"expected a whole number, found {value!r}"[:200], field=f"{where}{key}")
+                raise CorruptDataError(f"expected a whole number, found {_json.shown(value)}", field=f"{where}{key}")
     starts = [offset]
     for index, value in enumerate(lists["frames"] or []):
         raw = (min(count, (index + 1) * frame_rows) - index * frame_rows) * layout.row_bytes

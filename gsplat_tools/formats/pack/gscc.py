@@ -26,6 +26,7 @@ from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud, empty_cloud
 from gsplat_tools.constants import MAX_SH_DEGREE
 from gsplat_tools.errors import CapabilityError, CloudError, CorruptDataError, TruncatedDataError, UnsupportedVersionError
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, Scene
 from gsplat_tools.formats.knobs import Knob, general_knobs
@@ -114,6 +115,7 @@ def _parse(stream: BinaryIO) -> _Header:
         raise TruncatedDataError(
             f"{count} splats of degree {degree} take {expected} bytes but the file has {size}", field="count", offset=8
         )
+    check_splats(count, degree, None, field="count", offset=8)
     if size > expected:
         raise CorruptDataError(
             f"{count} splats of degree {degree} take {expected} bytes but the file has {size}", field="count", offset=8

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsplat_tools.errors import CorruptDataError
+from gsplat_tools.formats._json import shown
 
 
 def whole(entry: Mapping[str, Any], key: str, *, low: int = 0, high: int = 1 << 62, where: str = "") -> int:
@@ -18,7 +19,7 @@ def whole(entry: Mapping[str, Any], key: str, *, low: int = 0, high: int = 1 << 
     """
     value = entry.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise CorruptDataError(f"expected a whole number from {low} to {high}, found {value!r}", field=f"{where}{key}")
+        raise CorruptDataError(f"expected a whole number from {low} to {high}, found {shown(value)}", field=f"{where}{key}")
     return value
 
 
@@ -32,7 +33,7 @@ def numbers(entry: Mapping[str, Any], key: str, count: int, *, where: str = "") 
     """
     values = entry.get(key)
     if not isinstance(values, list) or len(values) != count:
-        raise CorruptDataError(f"expected {count} numbers, found {values!r}"[:200], field=f"{where}{key}")
+        raise CorruptDataError(f"expected {count} numbers, found {shown(values)}", field=f"{where}{key}")
     return [finite(value, f"{where}{key}") for value in values]
 
 
@@ -45,5 +46,5 @@ def finite(value: Any, field: str) -> float:
         It is not one.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-        raise CorruptDataError(f"expected a finite number, found {value!r}"[:200], field=field)
+        raise CorruptDataError(f"expected a finite number, found {shown(value)}", field=field)
     return float(value)

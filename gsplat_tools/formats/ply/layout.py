@@ -67,7 +67,7 @@ class SplatLayout:
 
     def find(self, name: str) -> PlyProperty:
         """Return the property of that name."""
-        return next(prop for prop in self.vertex.properties if prop.name == name)
+        return self.vertex.by_name[name]
 
     @property
     def has_wide_positions(self) -> bool:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gsplat_tools.chunks import CHUNK_SIZE, CloudChunks
 from gsplat_tools.cloud import GaussianCloud, TimeModel, empty_cloud
 from gsplat_tools.errors import LossyConversionWarning
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._motion_repair import MotionRepair
 from gsplat_tools.formats._ply_comments import SplatComments, splat_comments
 from gsplat_tools.formats._ply_header import PlyHeader, read_header
@@ -46,6 +47,14 @@ class PlyReader:
         self.layout: SplatLayout = splat_layout(header)
         self.comments: SplatComments = splat_comments(header, is_flat=self.layout.splat_columns[5] is None)
         self.num_splats = self.layout.vertex.count
+        check_splats(
+            self.num_splats,
+            self.layout.sh_degree,
+            None,
+            field="vertex",
+            offset=self.layout.vertex.line_offset,
+            has_motion=bool(self.layout.motion),
+        )
         self._rows: Rows = open_rows(stream, header, self.layout.vertex)
         self._time_model: TimeModel = options.time_model or self.comments.time_model or "window"
         self._columns = self.layout.float32_columns(self.layout.splat_columns)
@@ -144,7 +153,7 @@ class PlyReader:
             from gsplat_tools.kernels.columns import scatter_rows
 
             rows = records.view(np.float32).reshape(len(records), -1)
-            source_format=comments.source_format,
+            source_format = (comments.source_format,)
             arrays = (cloud.means, cloud.log_scales, cloud.quats, cloud.opacity_logits, cloud.sh0, cloud.shN)
             return bool(scatter_rows(rows, self._columns, self._normal_columns, *arrays))
         names = self.layout.splat_columns

@@ -12,20 +12,27 @@ from numpy.typing import NDArray
 
 from gsplat_tools.cloud import REST_COEFFICIENTS
 from gsplat_tools.errors import CorruptDataError
-from gsplat_tools.formats import _webp
-from gsplat_tools.formats._stream import MAX_EXPANSION, stream_size
+from gsplat_tools.formats import _json, _webp
+from gsplat_tools.formats._limits import splat_bytes, too_much
+from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats._zip import ZipReader, is_relative_name
 from gsplat_tools.formats.sog.meta import META_NAME, Meta, parse_meta
-from gsplat_tools.formats.sog.rules import PALETTE_COLUMNS, fault
+from gsplat_tools.formats.sog.rules import MAX_PALETTE, PALETTE_COLUMNS, fault
 
 Codes = NDArray[np.uint8]
+
+_LOOSE_FIT, _ANY_LAYOUT = 4, 1 << 16
+"""Images may be this many times as large as the splats need, and any image may have 65,536 pixels."""
+
+_PALETTE_PIXELS = MAX_PALETTE * REST_COEFFICIENTS[3]
+"""Pixels of the largest SH palette."""
 
 
 class Files(Protocol):
     """Files by relative name."""
 
-    def read(self, name: str) -> bytes:
-        """Return the bytes of a file, or raise CorruptDataError."""
+    def read(self, name: str, *, at_most: int | None = None) -> bytes:
+        """Return the bytes of a file, or raise FormatError where it is not there or larger than what it can need."""
         ...
 
     def __contains__(self, name: str) -> bool: ...
@@ -44,22 +51,40 @@ class Folder:
         self.root = root.resolve()
 
     def __contains__(self, name: str) -> bool:
-        return is_relative_name(name) and self._inside(name).is_file()
+        try:
+            return is_relative_name(name) and self._inside(name).is_file()
+        except (OSError, UnicodeEncodeError):  # longer than the file system allows, or not in its alphabet
+            return False
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, *, at_most: int | None = None) -> bytes:
         """Return the bytes of a file.
+
+        Parameters
+        ----------
+        name
+            Relative to the folder.
+        at_most
+            Bytes that what it holds can need.
 
         Raises
         ------
         CorruptDataError
             There is no such file inside the folder.
+        LimitExceededError
+            It has more than `at_most` bytes.
         """
         if not is_relative_name(name):
             raise fault("path", f"expected a relative path, found {name!r}", name)
         try:
-            return self._inside(name).read_bytes()
+            path = self._inside(name)
+            size = path.stat().st_size
+            if at_most is not None and size > at_most:
+                raise fault("zip-entry-size", f"expected at most {at_most} bytes, the file has {size}", name)
+            return path.read_bytes()
         except OSError as error:
             raise fault("file-missing", f"the file is not in the folder {self.root} ({error.strerror})", name) from error
+        except UnicodeEncodeError as error:
+            raise fault("path", f"the name is not in the alphabet of file names ({error.reason})", name) from error
 
     def _inside(self, name: str) -> Path:
         path = (self.root / name).resolve()
@@ -94,7 +119,7 @@ class Bundle:
         FormatError
             It is not a still lossless WebP image with a pixel for every splat.
         """
-        data, header = self._header(stream)
+        data, header = self._header(stream, _LOOSE_FIT * self.meta.count + _ANY_LAYOUT)
         if header.width * header.height < self.meta.count:
             raise fault(
                 "image-size",
@@ -113,7 +138,7 @@ class Bundle:
         """
         if self.meta.bands is not None:
             return self.meta.bands
-        width = self._header("shN_centroids")[1].width
+        width = self._header("shN_centroids", _PALETTE_PIXELS)[1].width
         for degree in (1, 2, 3):
             if width == PALETTE_COLUMNS * REST_COEFFICIENTS[degree]:
                 return degree
@@ -129,7 +154,7 @@ class Bundle:
         """
         path = self.path("shN_centroids")
         coefficients = REST_COEFFICIENTS[self.sh_degree()]
-        data, header = self._header("shN_centroids")
+        data, header = self._header("shN_centroids", _PALETTE_PIXELS)
         count = self.meta.palette_count
         if count is None:
             count = PALETTE_COLUMNS * header.height
@@ -145,21 +170,25 @@ class Bundle:
         check_indices(indices, len(self.meta.shn), path)
         return self.meta.shn[indices]
 
+    def stored_bytes(self) -> int:
+        """Return the bytes of the images in a folder; those that are missing have none."""
+        root = self.files.root if isinstance(self.files, Folder) else Path()
+        paths = {self.path(stream) for stream in self.meta.files}
+        return sum((root / path).stat().st_size for path in paths if path in self.files)
+
     def path(self, stream: str) -> str:
         """Return the name of an image's file."""
         return self.prefix + self.meta.files[stream]
 
-    def _header(self, stream: str) -> tuple[bytes, _webp.WebpHeader]:
-        """Return the file of an image and its size, held against the bytes that are there."""
+    def _header(self, stream: str, most_pixels: int) -> tuple[bytes, _webp.WebpHeader]:
+        """Return the file of an image and its size, held against what the scene can need."""
         path = self.path(stream)
         if path not in self.files:
             raise fault("file-missing", "the file that meta.json names is not there", path)
-        data = self.files.read(path)
+        data = self.files.read(path, at_most=_webp.most_bytes(most_pixels, 1))
         header = _webp.parse_header(data, field=path)
-        # Equal splats compress without end; an image of a few codebooks' worth of bytes is still allowed its megabytes.
-        claimed = 4 * header.width * header.height
-        if claimed > (len(data) + (1 << 14)) * MAX_EXPANSION:
-            message = f"the image claims {claimed} bytes in a file of {len(data)}, more than {MAX_EXPANSION} times"
+        if header.width * header.height > most_pixels:
+            message = f"expected at most {most_pixels} pixels, found {header.width} x {header.height}: far more than are used"
             raise fault("image-limit", message, path)
         return data, header
 
@@ -183,13 +212,37 @@ def open_bundle(stream: BinaryIO) -> tuple[Bundle | None, Folder | None]:
         if prefix + META_NAME not in archive:
             message = f"expected a meta.json at the root of the archive, found {len(archive.names)} other entries"
             raise fault("meta-missing", message, META_NAME)
-        return Bundle(archive, parse_meta(archive.read(prefix + META_NAME)), prefix), None
+        bundle = Bundle(archive, parse_meta(archive.read(prefix + META_NAME, at_most=_json.MAX_BYTES)), prefix)
+        check_count(bundle.meta, stream_size(stream))
+        return bundle, None
     folder = folder_of(stream)
-    data = stream.read(stream_size(stream))
+    data = stream.read(_json.MAX_BYTES + 1)
     stream.seek(0)
     if is_lod(data):
         return None, folder
-    return Bundle(folder, parse_meta(data)), None
+    bundle = Bundle(folder, parse_meta(data))
+    check_count(bundle.meta, bundle.stored_bytes())
+    return bundle, None
+
+
+def check_count(meta: Meta, available: int) -> None:
+    """Refuse more splats than the files can hold.
+
+    Parameters
+    ----------
+    meta
+        What is claimed.
+    available
+        Bytes of the archive, or of the images.
+
+    Raises
+    ------
+    LimitExceededError
+        There are.
+    """
+    message = too_much(meta.count * splat_bytes(3 if meta.bands is None else meta.bands), available)
+    if message is not None:
+        raise fault("image-limit", message, f"{META_NAME} count")
 
 
 def folder_of(stream: BinaryIO) -> Folder:

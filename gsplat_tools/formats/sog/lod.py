@@ -5,17 +5,20 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import PurePosixPath
 from typing import Any
 
 from gsplat_tools.cloud import GaussianCloud, concatenate
 from gsplat_tools.errors import CapabilityError
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._zip import ZipReader, is_relative_name
-from gsplat_tools.formats.sog.bundle import Bundle, Folder
+from gsplat_tools.formats.sog.bundle import Bundle, Folder, check_count
 from gsplat_tools.formats.sog.meta import META_NAME, Fields, parse_json, parse_meta
 from gsplat_tools.formats.sog.rules import fault
 
 LOD_NAME = "lod-meta.json"
+MAX_LEVELS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +86,11 @@ class LodScene:
 
         clouds: list[GaussianCloud] = []
         for bundle, pieces in self.bundles(level):
-            cloud = decode(bundle)
             for piece in pieces:
-                if piece.offset + piece.count > len(cloud):
-                    message = f"rows {piece.offset} to {piece.offset + piece.count} are named, {len(cloud)} are there"
+                if piece.offset + piece.count > bundle.meta.count:
+                    message = f"rows {piece.offset} to {piece.offset + piece.count} are named, {bundle.meta.count} are there"
                     raise fault("lod-tree", message, bundle.prefix + META_NAME)
+            cloud = decode(bundle)
             rows = [cloud.take(slice(piece.offset, piece.offset + piece.count)) for piece in pieces]
             clouds += [cloud] if _covers(pieces, len(cloud)) else rows
         if not clouds:
@@ -104,9 +107,13 @@ class LodScene:
         data = self.folder.read(name)
         if data[:2] == b"PK":
             archive = ZipReader(io.BytesIO(data))
-            return Bundle(archive, parse_meta(archive.read(META_NAME), f"{name} {META_NAME}"))
+            meta = parse_meta(archive.read(META_NAME, at_most=_json.MAX_BYTES), f"{name} {META_NAME}")
+            check_count(meta, len(data))
+            return Bundle(archive, meta)
         parent = str(PurePosixPath(name).parent)
-        return Bundle(self.folder, parse_meta(data, name), "" if parent == "." else parent + "/")
+        bundle = Bundle(self.folder, parse_meta(data, name), "" if parent == "." else parent + "/")
+        check_count(bundle.meta, bundle.stored_bytes())
+        return bundle
 
 
 def parse_lod(data: bytes, folder: Folder) -> LodScene:
@@ -127,21 +134,25 @@ def parse_lod(data: bytes, folder: Folder) -> LodScene:
     root = Fields(parse_json(data, LOD_NAME), LOD_NAME)
     version = root.value.get("version", 1)  # older files do not say it
     if version != 1:
-        raise fault("version", f"expected version 1, found {version!r}", root.at("version"))
+        raise fault("version", f"expected version 1, found {_json.shown(version)}", root.at("version"))
     filenames = root.value.get("filenames")
     if not isinstance(filenames, list) or not all(isinstance(name, str) for name in filenames):
         raise fault("files", "expected a list of file names", root.at("filenames"))
     num_levels = root.integer("lodLevels")
+    if num_levels > MAX_LEVELS:
+        raise fault("lod-tree", f"expected at most {MAX_LEVELS} levels, found {num_levels}", root.at("lodLevels"))
     environment = root.value.get("environment")
     for name in [*filenames, *([environment] if environment is not None else [])]:
         if not isinstance(name, str) or not is_relative_name(name):
-            raise fault("path", f"expected a relative path, found {name!r}", root.at("filenames"))
+            raise fault("path", f"expected a relative path, found {_json.shown(name)}", root.at("filenames"))
     levels: dict[int, list[Piece]] = {}
     for level, piece in _pieces(root.child("tree"), len(filenames)):
         if level >= num_levels:
             raise fault("lod-tree", f"expected levels below {num_levels}, found {level}", root.at("tree"))
         levels.setdefault(level, []).append(piece)
     ordered = [sorted(levels.get(i, []), key=lambda p: (p.file, p.offset)) for i in range(max(levels, default=-1) + 1)]
+    for pieces in ordered:
+        _check_disjoint(pieces, root)
     counts = root.value.get("counts")
     found = [sum(piece.count for piece in pieces) for pieces in ordered]
     if isinstance(counts, list) and counts[: len(found)] != found:
@@ -162,12 +173,20 @@ def _pieces(tree: Fields, num_files: int) -> Iterator[tuple[int, Piece]]:
         for key, reference in lods.items():
             where = node.at(f"lods.{key[:20]}")
             if not (key.isascii() and key.isdigit() and len(key) < 9 and isinstance(reference, dict)):
-                raise fault("lod-tree", f"expected a level and an object, found {key!r}", where)
+                raise fault("lod-tree", f"expected a level and an object, found {key[:20]!r}", where)
             fields = Fields(reference, where)
             piece = Piece(*(fields.integer(name) for name in ("file", "offset", "count")))
             if piece.file >= num_files:
                 raise fault("lod-tree", f"expected a file below {num_files}, found {piece.file}", fields.at("file"))
             yield int(key), piece
+
+
+def _check_disjoint(pieces: list[Piece], root: Fields) -> None:
+    """Refuse rows that are named twice in a level: few bytes would become many splats."""
+    for one, other in pairwise(piece for piece in pieces if piece.count):
+        if one.file == other.file and other.offset < one.offset + one.count:
+            message = f"rows {other.offset} to {one.offset + one.count} of file {one.file} are named twice in a level"
+            raise fault("lod-tree", message, root.at("tree"))
 
 
 def _covers(pieces: list[Piece], count: int) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import SplatModel
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats._zip import is_relative_name
 from gsplat_tools.formats.sog.rules import CODEBOOK_SIZE, MAX_PALETTE, fault
@@ -94,8 +95,8 @@ def parse_json(data: bytes, name: str) -> dict[str, Any]:
         The bytes are something else.
     """
     try:
-        root = json.loads(data.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
+        root = _json.parse(data)
+    except ValueError as error:
         raise fault("meta-json", f"expected a JSON object ({error})", name) from error
     if not isinstance(root, dict):
         raise fault("meta-json", f"expected a JSON object, found {type(root).__name__}", name)
@@ -124,7 +125,7 @@ def parse_meta(data: bytes, name: str = META_NAME) -> Meta:
     if version is None and "version" not in root.value:
         return _version_1(root)
     if version != 2 or isinstance(version, bool):
-        raise fault("version", f"expected version 2, or none for version 1, found {version!r}", root.at("version"))
+        raise fault("version", f"expected version 2, or none for version 1, found {_json.shown(version)}", root.at("version"))
     return _version_2(root)
 
 
@@ -168,10 +169,10 @@ def _version_1(root: Fields) -> Meta:
     shape = parts["means"].value.get("shape")
     count = shape[0] if isinstance(shape, list) and shape else None
     if not isinstance(count, int) or isinstance(count, bool) or count < 0:
-        raise fault("count", f"expected a shape that starts with a count, found {shape!r}", root.at("means.shape"))
+        raise fault("count", f"expected a shape that starts with a count, found {_json.shown(shape)}", root.at("means.shape"))
     encoding = parts["quats"].value.get("encoding", "quaternion_packed")
     if encoding != "quaternion_packed":
-        raise fault("quats-encoding", f'expected "quaternion_packed", found {encoding!r}', root.at("quats.encoding"))
+        raise fault("quats-encoding", f'expected "quaternion_packed", found {_json.shown(encoding)}', root.at("quats.encoding"))
     low, high = _means_range(parts["means"])
     colors = parts["sh0"].ramps(4)
     issues: list[Issue] = []
@@ -208,10 +209,10 @@ def _files(parts: dict[str, Fields]) -> dict[str, str]:
         names = part.value.get("files")
         streams = _FILES[key]
         if not isinstance(names, list) or len(names) < len(streams) or not all(isinstance(n, str) for n in names):
-            raise fault("files", f"expected {len(streams)} file names, found {names!r}", part.at("files"))
+            raise fault("files", f"expected {len(streams)} file names, found {_json.shown(names)}", part.at("files"))
         for stream, name in zip(streams, names, strict=False):
             if not is_relative_name(name):
-                raise fault("path", f"expected a relative path, found {name!r}", part.at("files"))
+                raise fault("path", f"expected a relative path, found {_json.shown(name)}", part.at("files"))
             files[stream] = name
     return files
 
@@ -223,7 +224,7 @@ def _splat_model(root: dict[str, Any], issues: list[Issue]) -> SplatModel:
     if model is None:
         return from_flag
     if model not in get_args(SplatModel):
-        message = f"the splat model {model!r} is not known and read as {from_flag!r}"
+        message = f"the splat model {_json.shown(model)} is not known and read as {from_flag!r}"
         issues.append(Issue(code="unknown-model", message=message, field=f"{META_NAME} model"))
         return from_flag
     if isinstance(antialias, bool) and antialias != (model == "antialiased"):
@@ -265,7 +266,7 @@ class Fields:
         """Return a field that is a whole number, not negative."""
         number = self._get(name, (int, float), "a whole number")
         if not (0 <= number <= 1 << 53 and number == int(number)):
-            raise fault("count", f"expected a whole number, found {number!r}", self.at(name))
+            raise fault("count", f"expected a whole number, found {_json.shown(number)}", self.at(name))
         return int(number)
 
     def numbers(self, name: str, size: int) -> Float64:
@@ -310,11 +311,11 @@ class Fields:
 
     def _finite(self, value: Any, name: str) -> float:
         if not isinstance(value, int | float) or isinstance(value, bool):
-            raise fault("number", f"expected a number, found {value!r}", self.at(name))
+            raise fault("number", f"expected a number, found {_json.shown(value)}", self.at(name))
         try:
             number = float(value)
         except OverflowError:
             number = math.inf
         if not math.isfinite(number):
-            raise fault("number", f"expected a finite number, found {value!r}", self.at(name))
+            raise fault("number", f"expected a finite number, found {_json.shown(value)}", self.at(name))
         return number

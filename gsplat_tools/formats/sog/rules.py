@@ -43,7 +43,11 @@ RULES: dict[str, Rule] = {
     "palette-count": _error(f"The SH palette has 1 to {MAX_PALETTE} entries."),
     "palette-size": _error(f"The image of centroids is {PALETTE_COLUMNS} times the coefficients wide and holds all entries."),
     "image-size": _error("Every image has a pixel for every splat."),
-    "image-limit": Rule(severity="error", meaning="Images claim no more than the file can hold.", error=LimitExceededError),
+    "image-limit": Rule(
+        severity="error",
+        meaning="Images are not far larger than the splats need, and splats claim no more than files can hold.",
+        error=LimitExceededError,
+    ),
     "lod-tree": _error("The tree of lod-meta.json refers to files, levels and rows that are there."),
     "label-range": Rule(severity="warning", meaning="SH labels are below the number of palette entries; others give no SH."),
     "unknown-model": Rule(severity="warning", meaning='"model" is "default", "antialiased" or "2dgs"; others read as default.'),

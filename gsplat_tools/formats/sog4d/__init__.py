@@ -16,11 +16,12 @@ import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CloudError
-from gsplat_tools.formats._issues import Issue
+from gsplat_tools.formats._issues import Issue, raise_errors
+from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats._webp import Image
 from gsplat_tools.formats._zip import ZipReader
 from gsplat_tools.formats.base import Bounds, FileInfo, Format
-from gsplat_tools.formats.sog4d.bundle import Bundle, read_meta
+from gsplat_tools.formats.sog4d.bundle import REPEATABLE, Bundle, check_layout, read_meta
 from gsplat_tools.formats.sog4d.decode import read
 from gsplat_tools.formats.sog4d.encode import write
 from gsplat_tools.formats.sog4d.options import KNOBS, Sog4dOptions, Sog4dReadOptions
@@ -72,8 +73,9 @@ def inspect(stream: BinaryIO) -> FileInfo:
     FormatError
         The bundle breaks a rule of the archive or of meta.json.
     """
-    archive = ZipReader(stream)
+    archive = ZipReader(stream, repeatable=REPEATABLE)
     meta, _ = read_meta(archive)
+    raise_errors(check_layout(meta, stream_size(stream)), RULES)
     palettes = {
         palette.name: {
             "entries": palette.count,

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.errors import FormatError
-from gsplat_tools.formats import _webp
+from gsplat_tools.formats import _json, _webp
 from gsplat_tools.formats._issues import Issue, raise_errors, refuse
-from gsplat_tools.formats._stream import MAX_EXPANSION, stream_size
+from gsplat_tools.formats._limits import splat_bytes, too_much
+from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats._webp import Image
 from gsplat_tools.formats._zip import ZipReader
 from gsplat_tools.formats.sog4d import labels as label_files
@@ -23,6 +25,9 @@ from gsplat_tools.formats.sog4d.rules import RULES
 from gsplat_tools.formats.sog4d.textures import check_indices, index_image, indices_of
 
 _KEPT_SEGMENTS = 4
+
+REPEATABLE = ("meta.json",)
+"""Entries that may occur again: the fork's `normalize-meta` adds a second meta.json."""
 
 
 class Bundle:
@@ -40,7 +45,7 @@ class Bundle:
     """
 
     def __init__(self, stream: BinaryIO) -> None:
-        self.archive = ZipReader(stream)
+        self.archive = ZipReader(stream, repeatable=REPEATABLE)
         self.meta, self.issues = read_meta(self.archive)
         self.issues += raise_errors(check_layout(self.meta, stream_size(stream)), RULES)
         raise_errors(missing_files(self.meta, self.archive), RULES)
@@ -55,8 +60,8 @@ class Bundle:
         FormatError
             It is not a still lossless WebP image of the layout's size.
         """
-        data = self.archive.read(path, frame=frame)
         width, height = self.meta.width, self.meta.height
+        data = self.archive.read(path, frame=frame, at_most=_webp.most_bytes(width, height))
         try:
             header = _webp.parse_header(data, field=path, frame=frame)
             if (header.width, header.height) == (width, height):
@@ -106,7 +111,7 @@ class Bundle:
         CorruptDataError
             The file has another size, or holds numbers that are not finite.
         """
-        data = self.archive.read(palette.centroids_path)
+        data = self.archive.read(palette.centroids_path, at_most=2 * centroid_bytes(palette))
         raise_errors(check_centroids(palette, data), RULES)
         values = np.frombuffer(data, palette.centroids_dtype).astype(np.float32)
         return values.reshape(palette.count, palette.coefficients, 3)
@@ -118,7 +123,8 @@ class Bundle:
 
     def _open_segment(self, palette: PaletteMeta, segment: Segment) -> _SegmentLabels:
         base = self._label_image(palette, segment.base_labels_path, segment.start_frame)
-        data = self.archive.read(segment.delta_path, frame=segment.start_frame)
+        most = label_files.most_bytes(segment, self.meta.splat_count)
+        data = self.archive.read(segment.delta_path, frame=segment.start_frame, at_most=most)
         blocks, issues = label_files.read_delta(data, segment, self.meta.splat_count, palette.count)
         raise_errors(issues, RULES)
         return _SegmentLabels(base, blocks)
@@ -156,44 +162,50 @@ def read_meta(archive: ZipReader) -> tuple[Meta, list[Issue]]:
     if "meta.json" not in archive:
         message = f"expected a meta.json at the root of the archive, found {len(archive.names)} other entries"
         raise refuse(Issue(code="meta-missing", message=message, field="meta.json"), RULES)
-    meta, issues = parse_meta(archive.read("meta.json"))
+    meta, issues = parse_meta(archive.read("meta.json", at_most=_json.MAX_BYTES))
     rest = raise_errors(issues, RULES)
     assert meta is not None
     return meta, rest
 
 
 def check_layout(meta: Meta, size: int) -> list[Issue]:
-    """Return an issue where the images of a frame are beyond what a file of this size can hold."""
-    claimed = meta.width * meta.height * 4
-    if claimed <= size * MAX_EXPANSION:
+    """Return an issue where the images and splats of a frame are beyond what a file of this size can hold."""
+    claimed = max(meta.width * meta.height * 4, meta.splat_count * splat_bytes(meta.bands))
+    message = too_much(claimed, size)
+    if message is None:
         return []
-    message = (
-        f"images of {meta.width} x {meta.height} pixels take {claimed} bytes, over {MAX_EXPANSION} times the file's {size}"
-    )
     return [Issue(code="layout-limit", message=message, field="meta.json layout", value=claimed)]
 
 
-def missing_files(meta: Meta, archive: ZipReader) -> list[Issue]:
-    """Return an issue for every file that meta.json names and the archive lacks."""
-    names = set(archive.names)
-    wanted: list[tuple[str, int | None]] = [
-        (frame_path(path, frame), frame) for frame in range(meta.frame_count) for path in meta.stream_paths().values()
-    ]
+def missing_files(meta: Meta, archive: ZipReader) -> Iterator[Issue]:
+    """Yield an issue for every file that meta.json names and the archive lacks."""
+    for path, frame in _wanted_files(meta):
+        if path not in archive:
+            message = "expected this file in the archive, found none"
+            yield Issue(code="file-missing", message=message, field=path, frame=frame)
+
+
+def _wanted_files(meta: Meta) -> Iterator[tuple[str, int | None]]:
+    """Yield (name, frame) of every file that meta.json names."""
+    for frame in range(meta.frame_count):
+        for path in meta.stream_paths().values():
+            yield frame_path(path, frame), frame
     for palette in meta.palettes:
-        wanted.append((palette.centroids_path, None))
+        yield palette.centroids_path, None
         for segment in palette.segments:
-            wanted += [(segment.base_labels_path, segment.start_frame), (segment.delta_path, segment.start_frame)]
-    return [
-        Issue(code="file-missing", message="expected this file in the archive, found none", field=path, frame=frame)
-        for path, frame in wanted
-        if path not in names
-    ]
+            yield segment.base_labels_path, segment.start_frame
+            yield segment.delta_path, segment.start_frame
+
+
+def centroid_bytes(palette: PaletteMeta) -> int:
+    """Return the size of a centroid file."""
+    return palette.count * palette.coefficients * 3 * palette.centroids_dtype.itemsize
 
 
 def check_centroids(palette: PaletteMeta, data: bytes) -> list[Issue]:
     """Return what is wrong with a centroid file."""
     field = palette.centroids_path
-    expected = palette.count * palette.coefficients * 3 * palette.centroids_dtype.itemsize
+    expected = centroid_bytes(palette)
     if len(data) != expected:
         message = (
             f"expected {expected} bytes ({palette.count} entries of {palette.coefficients} x 3 {palette.centroids_type}), "

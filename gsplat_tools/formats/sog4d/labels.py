@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from gsplat_tools.formats import _label_delta
 from gsplat_tools.formats._issues import Issue
-from gsplat_tools.formats._label_delta import DeltaSegment, Labels, changes
+from gsplat_tools.formats._label_delta import UPDATE, DeltaSegment, Labels, changes
 from gsplat_tools.formats.sog4d.meta import Segment
 
 MAGIC = b"SOG4DLB1"
 
-__all__ = ["MAGIC", "Labels", "changes", "read_delta", "write_delta"]
+__all__ = ["MAGIC", "Labels", "changes", "most_bytes", "read_delta", "write_delta"]
 
 
 def write_delta(segment: tuple[int, int], splat_count: int, label_count: int, blocks: Sequence[NDArray[Any]]) -> bytes:
@@ -23,6 +23,11 @@ def write_delta(segment: tuple[int, int], splat_count: int, label_count: int, bl
         field="", start_frame=segment[0], frame_count=segment[1], splat_count=splat_count, label_count=label_count
     )
     return _label_delta.write_delta(described, blocks, magic=MAGIC)
+
+
+def most_bytes(segment: Segment, splat_count: int) -> int:
+    """Return the largest size of a delta file: every splat changes in every frame; and some, to say what follows."""
+    return 1024 + segment.frame_count * (4 + splat_count * UPDATE.itemsize)
 
 
 def read_delta(data: bytes, segment: Segment, splat_count: int, label_count: int) -> tuple[list[NDArray[Any]], list[Issue]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats._webp import MAX_SIDE
 from gsplat_tools.formats._zip import is_relative_name
@@ -20,15 +21,15 @@ def parse_meta(data: bytes) -> tuple[Meta | None, list[Issue]]:
     """Return what meta.json says, or None where an error forbids it, and everything that is wrong with it."""
     issues: list[Issue] = []
     try:
-        text = data.decode("utf-8-sig")
+        data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         issue = Issue(
             code="meta-encoding", message=f"expected UTF-8, found {error.reason}", field="meta.json", offset=error.start
         )
         return None, [issue]
     try:
-        root = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        root = _json.parse(data)
+    except ValueError as error:
         return None, [Issue(code="meta-json", message=f"expected a JSON object ({error})", field="meta.json")]
     if not isinstance(root, dict):
         message = f"expected a JSON object, found {type(root).__name__}"
@@ -214,7 +215,8 @@ class _Reader:
             raise _MissingError
         sh0_path = self.template(stream, path, "sh0Path")
         field = f"{path}.sh0Codebook"
-        codebook = self.numbers(self.get(stream, path, "sh0Codebook", list, "256 numbers"), field).astype(np.float32)
+        with np.errstate(over="ignore"):  # refused below
+            codebook = self.numbers(self.get(stream, path, "sh0Codebook", list, "256 numbers"), field).astype(np.float32)
         if len(codebook) != SH0_ENTRIES:
             self.fail(
                 "sh0-codebook-length", field, f"expected {SH0_ENTRIES} numbers, found {len(codebook)}", value=len(codebook)

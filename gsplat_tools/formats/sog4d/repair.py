@@ -6,8 +6,10 @@ import json
 from typing import Any, BinaryIO
 
 from gsplat_tools.errors import CorruptDataError
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import raise_errors
 from gsplat_tools.formats._zip import ZipReader, ZipWriter
+from gsplat_tools.formats.sog4d.bundle import REPEATABLE
 from gsplat_tools.formats.sog4d.meta_reader import parse_meta
 from gsplat_tools.formats.sog4d.rules import RULES
 
@@ -34,12 +36,12 @@ def repair(source: BinaryIO, target: BinaryIO) -> list[str]:
     CorruptDataError
         There is no meta.json that could be repaired, or more is wrong with it than its spelling.
     """
-    archive = ZipReader(source)
+    archive = ZipReader(source, repeatable=REPEATABLE)
     if "meta.json" not in archive:
         raise CorruptDataError("there is no meta.json to repair", field="meta.json")
     try:
-        root = json.loads(archive.read("meta.json").decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
+        root = _json.parse(archive.read("meta.json", at_most=_json.MAX_BYTES))
+    except ValueError as error:
         raise CorruptDataError(f"expected a JSON object ({error})", field="meta.json") from error
     if not isinstance(root, dict):
         raise CorruptDataError(f"expected a JSON object, found {type(root).__name__}", field="meta.json")
@@ -49,13 +51,12 @@ def repair(source: BinaryIO, target: BinaryIO) -> list[str]:
     num_doubles = len(archive.issues)
     if num_doubles:
         changes.append(f"entries that occurred more than once kept as the last one ({num_doubles} remarks on the archive)")
-    writer = ZipWriter(target)
-    for name in sorted(archive.names):
-        if name == "meta.json":
-            writer.add(name, data, "deflated")
-        else:
-            writer.add(name, archive.read(name), "stored" if archive.method(name) == "stored" else "deflated")
-    writer.close()
+    with ZipWriter(target) as writer:
+        for name in sorted(archive.names):
+            if name == "meta.json":
+                writer.add(name, data, "deflated")
+            else:
+                writer.add(name, archive.read(name), "stored" if archive.method(name) == "stored" else "deflated")
     return changes
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from typing import BinaryIO
 
 import numpy as np
 
 from gsplat_tools.errors import FormatError
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats._zip import ZipReader
-from gsplat_tools.formats.sog4d.bundle import Bundle, check_centroids, check_layout, missing_files
+from gsplat_tools.formats.sog4d import labels as label_files
+from gsplat_tools.formats.sog4d.bundle import REPEATABLE, Bundle, centroid_bytes, check_centroids, check_layout, missing_files
 from gsplat_tools.formats.sog4d.decode import GENERATOR
-from gsplat_tools.formats.sog4d.labels import read_delta
 from gsplat_tools.formats.sog4d.meta import Meta, PaletteMeta, frame_path
 from gsplat_tools.formats.sog4d.meta_reader import parse_meta
 from gsplat_tools.formats.sog4d.rules import RULES
@@ -29,7 +31,7 @@ def check(stream: BinaryIO) -> Iterator[Issue]:
         Can seek.
     """
     try:
-        archive = ZipReader(stream, refuses=False)
+        archive = ZipReader(stream, refuses=False, repeatable=REPEATABLE)
     except FormatError as error:
         yield _issue(error, "zip-invalid")
         return
@@ -41,16 +43,18 @@ def check(stream: BinaryIO) -> Iterator[Issue]:
         yield Issue(code="meta-missing", message=message, field="meta.json")
         return
     try:
-        meta, issues = parse_meta(archive.read("meta.json"))
+        meta, issues = parse_meta(archive.read("meta.json", at_most=_json.MAX_BYTES))
     except FormatError as error:
         yield _issue(error, "zip-entry-corrupt")
         return
     yield from issues
     if meta is None:
         return
-    blocking = [*check_layout(meta, stream_size(stream)), *missing_files(meta, archive)]
-    yield from blocking
-    if blocking:
+    is_whole = True
+    for issue in chain(check_layout(meta, stream_size(stream)), missing_files(meta, archive)):
+        is_whole = False
+        yield issue
+    if not is_whole:
         return
     yield from _check_data(Bundle(stream))
     yield from _remarks(meta, archive)
@@ -93,17 +97,19 @@ def _check_image(bundle: Bundle, stream: str, path: str, frame: int) -> Iterator
 def _check_palette(bundle: Bundle, palette: PaletteMeta) -> Iterator[Issue]:
     """Read centroids, base labels and delta files."""
     try:
-        yield from check_centroids(palette, bundle.archive.read(palette.centroids_path))
+        data = bundle.archive.read(palette.centroids_path, at_most=2 * centroid_bytes(palette))
+        yield from check_centroids(palette, data)
     except FormatError as error:
         yield _issue(error, "zip-entry-corrupt")
     for segment in palette.segments:
         yield from _check_image(bundle, f"{palette.name}_labels", segment.base_labels_path, segment.start_frame)
         try:
-            data = bundle.archive.read(segment.delta_path, frame=segment.start_frame)
+            most = label_files.most_bytes(segment, bundle.meta.splat_count)
+            data = bundle.archive.read(segment.delta_path, frame=segment.start_frame, at_most=most)
         except FormatError as error:
             yield _issue(error, "zip-entry-corrupt")
             continue
-        yield from read_delta(data, segment, bundle.meta.splat_count, palette.count)[1]
+        yield from label_files.read_delta(data, segment, bundle.meta.splat_count, palette.count)[1]
 
 
 def _remarks(meta: Meta, archive: ZipReader) -> Iterator[Issue]:

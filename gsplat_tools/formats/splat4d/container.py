@@ -22,6 +22,7 @@ from typing import BinaryIO, Literal
 from gsplat_tools.cloud import TimeModel
 from gsplat_tools.constants import TEMPORAL_CUTOFF
 from gsplat_tools.errors import CorruptDataError, GsplatWarning, TruncatedDataError, UnsupportedVersionError
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._stream import read_exactly, stream_size
 
 MAGIC = b"SPL4DV02"
@@ -125,6 +126,7 @@ def parse(stream: BinaryIO) -> Contents:
     if model not in TIME_MODELS:
         raise CorruptDataError(f"expected 1 (window) or 2 (gaussian), found {model}", offset=32, field="timeModel")
     sections = _read_table(stream, size, table_offset, section_count)
+    check_splats(splat_count, bands, None, field="splatCount", offset=24, has_motion=True)
     records = _only(sections, "RECS", 0)
     _check_length(records, splat_count * RECORD_BYTES, f"{splat_count} records")
     meta = _only(sections, "META", 0)

@@ -22,6 +22,7 @@ from gsplat_tools.errors import (
 )
 from gsplat_tools.formats._issues import raise_errors
 from gsplat_tools.formats._label_delta import RULES, DeltaSegment, Labels, read_delta
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._motion_repair import MotionRepair
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import FileInfo
@@ -60,6 +61,7 @@ def version_of(stream: BinaryIO) -> int:
             f"but {size} bytes are no multiple of that",
             offset=size - size % RECORD_BYTES,
         )
+    check_splats(size // RECORD_BYTES, 0, None, field="RECS", has_motion=True)
     return 1
 
 

@@ -9,7 +9,7 @@ from gsplat_tools.attributes.coordinate_systems import UNKNOWN, Y_UP_OR_DOWN, Z_
 from gsplat_tools.cloud import REST_COEFFICIENTS
 from gsplat_tools.constants import MAX_SH_DEGREE
 from gsplat_tools.errors import CapabilityError, CorruptDataError, LimitExceededError, UnsupportedVersionError
-from gsplat_tools.formats._stream import check_claim
+from gsplat_tools.formats._limits import check_splats
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -33,8 +33,6 @@ SYSTEMS = (UNKNOWN, *Y_UP_OR_DOWN, *Z_UP_OR_DOWN)
 """Coordinate systems by their number in the extension."""
 
 _RECORD = struct.Struct("<II")
-_ALWAYS_READ = 64 << 20
-"""Bytes that a file may claim whatever its size: splats that are all alike compress without limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,8 +101,7 @@ def check_fields(header: Header, *, available: int) -> None:
         raise CorruptDataError(
             f"expected at most {MAX_FRACTIONAL_BITS}, found {header.fractional_bits}", field="fractionalBits", offset=13
         )
-    if header.raw_length() > _ALWAYS_READ:
-        check_claim(header.raw_length(), available, field="numPoints", offset=8)
+    check_splats(header.num_splats, header.sh_degree, available, field="numPoints", offset=8)
 
 
 def check_version(version: int, known: tuple[int, ...], how: str) -> None:

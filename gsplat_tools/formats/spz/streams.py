@@ -34,7 +34,8 @@ _LEVEL_OF_NOISE = 9
 _REWARDING = ("alphas", "colors", "sh")
 """Attributes that get smaller above level 9 of zstd; up to level 12 the others take three times as long for nothing."""
 _LEVEL_FOR_ALL = 12
-_MAX_WINDOW = 1 << 27
+_MAX_WINDOW, _ANY_WINDOW = 1 << 27, 1 << 25
+"""Largest window of a frame, bytes: the decoder allocates it, so that short streams are allowed less."""
 
 
 def read_header(stream: BinaryIO) -> tuple[Header, dict[str, tuple[int, int]]]:
@@ -109,7 +110,8 @@ def read_payload(stream: BinaryIO, header: Header, places: dict[str, tuple[int, 
         offset, length = places[name]
         section = _Section(stream, offset, length, lock)
         buffer = payload[name].reshape(-1).data
-        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+        window = min(max(1 << len(buffer).bit_length(), _ANY_WINDOW), _MAX_WINDOW)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=window)
         try:
             with decompressor.stream_reader(cast("BinaryIO", section), read_across_frames=True, closefd=False) as reader:
                 done = 0
