@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 @click.option("--overwrite", is_flag=True, help="Replace a picture that is there.")
 @options.jobs_option
 @options.max_memory_option
-@options.max_memory_option
 @options.json_option
 @options.progress_option
 @reports_errors

@@ -55,8 +55,8 @@ class Description:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     coordinate_system: str = UNKNOWN
     splat_model: SplatModel = "default"
-    time_model: TimeModel | None = None
     source_format: str = ""
+    time_model: TimeModel | None = None
     temporal_cutoff: float = TEMPORAL_CUTOFF
     encoding: SplatEncoding | None = None
     rotation: str | None = None
@@ -83,9 +83,9 @@ class Description:
             "coordinate_system": self.coordinate_system,
             "splat_model": self.splat_model,
         }
-        if self.encoding is not None:
         if self.source_format:
             entry["source_format"] = self.source_format
+        if self.encoding is not None:
             entry["splat_encoding"] = self.encoding.to_json()
         if self.rotation is not None:
             entry["rotation"] = self.rotation
@@ -125,8 +125,8 @@ class Description:
             origin=(x, y, z),
             coordinate_system=system,
             splat_model=_choice(entry, "splat_model", get_args(SplatModel)),
-            time_model=None if time_model is None else _choice(entry, "time_model", get_args(TimeModel)),
             source_format=source_format_of(entry.get("source_format")),
+            time_model=None if time_model is None else _choice(entry, "time_model", get_args(TimeModel)),
             temporal_cutoff=_cutoff(entry),
             encoding=SplatEncoding.from_json(ranges) if layout == "spark" else None,
             rotation=rotation if isinstance(rotation, str) else None,
@@ -138,8 +138,8 @@ class Description:
             "origin": np.array(self.origin),
             "coordinate_system": self.coordinate_system,
             "splat_model": self.splat_model,
-            "time_model": self.time_model or "window",
             "source_format": self.source_format,
+            "time_model": self.time_model or "window",
             "temporal_cutoff": self.temporal_cutoff,
         }
 

@@ -143,6 +143,7 @@ class PlyReader:
             coordinate_system=comments.coordinate_system,
             origin=comments.origin + self._shift,
             splat_model=comments.splat_model,
+            source_format=comments.source_format,
             **changes,
         )
         return cloud, normals_found.is_set()
@@ -153,7 +154,6 @@ class PlyReader:
             from gsplat_tools.kernels.columns import scatter_rows
 
             rows = records.view(np.float32).reshape(len(records), -1)
-            source_format = (comments.source_format,)
             arrays = (cloud.means, cloud.log_scales, cloud.quats, cloud.opacity_logits, cloud.sh0, cloud.shN)
             return bool(scatter_rows(rows, self._columns, self._normal_columns, *arrays))
         names = self.layout.splat_columns
