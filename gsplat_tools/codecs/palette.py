@@ -16,12 +16,16 @@ Labels = NDArray[np.int64]
 _TOLERANCE = 2e-3
 """Rounds end when one lowers the error by less than this share."""
 
+_STEP = np.float32(1.8)
+"""How far entries move towards the mean of their points and beyond, but for the last round: four rounds then do what seven
+do without, and the end is better (docs/codebooks.md)."""
+
 _MIN_FIRST_POINTS = 1 << 15
-_FIRST_POINTS_PER_ENTRY = 8
+_FIRST_POINTS_PER_ENTRY = 16
 
 
 @remembered
-def fit_palette(points: Float32, weights: Float32, *, size: int, max_rounds: int = 3) -> Float32:
+def fit_palette(points: Float32, weights: Float32, *, size: int, max_rounds: int = 5) -> Float32:
     """Return at most `size` centroids with a small weighted squared error to the points.
 
     Parameters
@@ -50,7 +54,7 @@ def fit_palette(points: Float32, weights: Float32, *, size: int, max_rounds: int
     -----
     The cell that errs most is cut in two along its widest principal direction until there are `size` cells; Lloyd rounds
     then start from their means. Nothing is drawn at random. In three dimensions the cuts alone come within a few percent
-    of converged k-means. Cuts and the first round take an even choice of 8 points an entry, 32,768 at least; later rounds
+    of converged k-means. Cuts and the first round take an even choice of 16 points an entry, 32,768 at least; later rounds
     take all points (docs/codebooks.md).
     """
     if size < 1 or len(points) == 0:
@@ -74,35 +78,35 @@ def _fit(points: Float32, weights: Float32, size: int, max_rounds: int) -> Float
     centroids = centroids[:count] @ axes.T + center
     if count < size and len(some) == len(points):
         return np.unique(points, axis=0)  # every cell holds equal points
-    if max_rounds > 0 and len(some) < len(points):
-        centroids, _ = _refine(some, some_weights, centroids)
-        max_rounds -= 1
     before = np.inf
-    for _ in range(max_rounds):
-        centroids, error = _refine(points, weights, centroids)
-        if error >= before * (1 - _TOLERANCE):
+    for round_id in range(max_rounds):
+        is_part = round_id == 0 and len(some) < len(points)
+        rows, row_weights = (some, some_weights) if is_part else (points, weights)
+        labels, distances = nearest_labels(rows, centroids)
+        error = np.inf if is_part else float(np.dot(distances.astype(np.float64), row_weights))
+        is_last = round_id == max_rounds - 1 or (error >= before * (1 - _TOLERANCE) and np.isfinite(error))
+        centroids = _moved(centroids, rows, row_weights, labels, distances, np.float32(1) if is_last else _STEP)
+        if is_last:
             break
         before = error
     return centroids
 
 
-def _refine(points: Float32, weights: Float32, centroids: Float32) -> tuple[Float32, float]:
-    """Return centroids after one Lloyd round, and the weighted error before it."""
-    labels, distances = nearest_labels(points, centroids)
-    error = float(np.dot(distances.astype(np.float64), weights))
-    return _means_of_clusters(points, weights, labels, distances, centroids), error
-
-
-def _means_of_clusters(points: Float32, weights: Float32, labels: Labels, distances: Float32, centroids: Float32) -> Float32:
-    """Return the weighted means; empty clusters move to the points that err most."""
+def _moved(
+    centroids: Float32, points: Float32, weights: Float32, labels: Labels, distances: Float32, step: np.float32
+) -> Float32:
+    """Return centroids after a step towards their weighted means; empty clusters move to the points that err most."""
     from gsplat_tools.kernels.nearest import add_to_clusters
 
     sums = np.zeros(centroids.shape, np.float64)
     totals = np.zeros(len(centroids), np.float64)
-    add_to_clusters(points, np.ascontiguousarray(weights, np.float32), labels, sums, totals)
+    add_to_clusters(points, weights, labels, sums, totals)
     is_empty = totals <= 0
     means = (sums / np.where(is_empty, 1.0, totals)[:, None]).astype(np.float32)
+    moved = means if step == 1 else centroids + step * (means - centroids)
     if is_empty.any():
         worst = np.argsort(-(distances.astype(np.float64) * weights), kind="stable")[: np.count_nonzero(is_empty)]
-        means[np.flatnonzero(is_empty)[: len(worst)]] = points[worst]
-    return means
+        places = np.flatnonzero(is_empty)
+        moved[places] = centroids[places]
+        moved[places[: len(worst)]] = points[worst]
+    return moved

@@ -149,7 +149,7 @@ class _Cells:
         from gsplat_tools.kernels.cells import CELL, GROUP
 
         center, axes = principal_axes(centroids, np.ones(len(centroids), np.float32))
-        turned: Float32 = (centroids - center) @ axes
+        turned = np.matmul(centroids - center, axes)
         order, starts = _halve(np.ascontiguousarray(turned[:, :_SPLIT_AXES]), CELL)
         groups, tails = _grouped(turned[order])
         sizes = np.diff(starts, append=len(order))
@@ -172,7 +172,7 @@ class _Cells:
         work = np.zeros(-(-len(points) // _CELL_POINTS), np.int64)
 
         def assign(start: int, stop: int) -> None:
-            turned: Float32 = (points[start:stop] - self.center) @ self.axes
+            turned = np.matmul(points[start:stop] - self.center, self.axes)
             groups, tails = _grouped(turned)
             work[start // _CELL_POINTS] = nearest_in_cells(
                 groups, tails, self.entries, self.lows, self.highs, probes, is_exact, slots[start:stop], distances[start:stop]

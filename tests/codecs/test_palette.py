@@ -174,3 +174,25 @@ def test_fit__refuses_nothing_to_fit() -> None:
         fit_palette(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), size=4)
     with pytest.raises(ValueError, match="at least 1"):
         fit_palette(np.zeros((2, 3), np.float32), np.ones(2, np.float32), size=0)
+
+
+def test_fit__of_points_in_few_places_keeps_entries_for_all(rng: np.random.Generator) -> None:
+    points = np.repeat(rng.normal(0, 1, (50, 9)).astype(np.float32), 20, axis=0)
+    points += rng.normal(0, 1e-4, points.shape).astype(np.float32)
+
+    palette = fit_palette(points, rng.random(1000).astype(np.float32) + np.float32(0.1), size=60, max_rounds=6)
+
+    assert np.isfinite(palette).all()
+    assert nearest_labels(points, palette)[1].max() < 1e-5
+
+
+def test_more_rounds__err_less(rng: np.random.Generator) -> None:
+    points = rng.normal(0, 1, (4000, 9)).astype(np.float32)
+    weights = rng.random(4000).astype(np.float32) + np.float32(0.1)
+
+    errors = [
+        np.average(nearest_labels(points, fit_palette(points, weights, size=100, max_rounds=rounds))[1], weights=weights)
+        for rounds in (0, 1, 3, 6)
+    ]
+
+    assert errors == sorted(errors, reverse=True)

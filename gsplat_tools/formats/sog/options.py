@@ -50,7 +50,7 @@ class SogOptions:
 
     sh_palette_size: int | None = None
     rotation: RotationMode = "best"
-    palette_rounds: int = 3
+    palette_rounds: int = 5
     webp_effort: int = DEFAULT_EFFORT
     seed: int = 0
 
