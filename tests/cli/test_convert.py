@@ -268,3 +268,18 @@ def test_convert__that_is_ended_removes_its_temporary_file(tmp_path: Path) -> No
 
     assert process.wait(60) == 128 + signal.SIGTERM
     assert not any((tmp_path / "out").iterdir())
+
+
+def test_dry_run__estimates_and_writes_nothing(tmp_path: Path) -> None:
+    source = tmp_path / "scene.ply"
+    save(random_cloud(200, sh_degree=1), source)
+
+    result = run(source, tmp_path / "out.gspk", "--dry-run", "--json")
+
+    report = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert not (tmp_path / "out.gspk").exists()
+    assert report["exact"]
+    assert report["target"]["format"] == "spark"
+    run(source, tmp_path / "out.gspk")
+    assert (tmp_path / "out.gspk").stat().st_size == report["bytes"]

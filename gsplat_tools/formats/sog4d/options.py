@@ -98,7 +98,7 @@ class Sog4dOptions:
     zip: ZipMode = "auto"
     rotation: RotationMode = "small"
     rotation_steps: int = 64
-    palette_rounds: int = 3
+    palette_rounds: int = 5
     keep_tolerance: float = 0.05
     time_mapping: Literal["auto", "uniform", "explicit"] = "auto"
     frame_times: Sequence[float] | None = None
