@@ -14,11 +14,12 @@ from gsplat_tools.attributes import activations
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import common_frames, compare, frame_levels, still
 from gsplat_tools.constants import VISIBLE_OPACITY
-from gsplat_tools.errors import CapabilityError
+from gsplat_tools.errors import CapabilityError, counts_in_words
 from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats.base import FileInfo, Format
 from gsplat_tools.formats.loading import inspect_file, load, open_scene
 from gsplat_tools.formats.sequences import open_sequence
+from gsplat_tools.ops.filtering import locate_invalid
 from gsplat_tools.ops.recentering import position_step
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
@@ -99,17 +100,17 @@ def _columns(cloud: GaussianCloud) -> Mapping[str, NDArray[Any]]:
     if cloud.sh_degree == 0:
         del columns["shN"]
     columns["opacities"] = activations.sigmoid(cloud.opacity_logits)
-    columns["quat_norms"] = np.linalg.norm(cloud.quats, axis=1)
+    columns["quat_norms"] = np.linalg.norm(cloud.quats.astype(np.float64), axis=1)  # squares overflow float32
     columns["aspect"] = _aspects(cloud)
     columns.update({name: values for name, values in cloud.extra.items() if np.issubdtype(values.dtype, np.number)})
     return columns
 
 
-def _aspects(cloud: GaussianCloud) -> NDArray[np.float32]:
-    """Return longest over second longest axis of every splat."""
+def _aspects(cloud: GaussianCloud) -> NDArray[np.float64]:
+    """Return longest over second longest axis of every splat, infinite for lines, 1 for points."""
+    ordered = np.sort(cloud.log_scales.astype(np.float64), axis=1)
     with np.errstate(invalid="ignore", over="ignore"):
-        ordered = np.sort(cloud.log_scales, axis=1)
-        return np.asarray(np.exp(ordered[:, 2] - ordered[:, 1]), np.float32)
+        return np.asarray(np.exp(np.where(ordered[:, 2] == ordered[:, 1], 0.0, ordered[:, 2] - ordered[:, 1])))
 
 
 def describe_values(values: NDArray[Any]) -> dict[str, Any]:
@@ -122,7 +123,10 @@ def describe_values(values: NDArray[Any]) -> dict[str, Any]:
     if finite.size == 0:
         empty = dict.fromkeys(("min", "max", "mean", "std"))
         return {**empty, "percentiles": {}, "nan": num_nan, "inf": num_inf, "histogram": {"edges": [], "counts": []}}
-    counts, edges = np.histogram(finite, bins=HISTOGRAM_BINS)
+    try:
+        counts, edges = np.histogram(finite, bins=HISTOGRAM_BINS)
+    except ValueError:  # bins narrower than float64 can part, or wider than it holds
+        counts, edges = np.array([finite.size]), np.array([finite.min(), finite.max()])
     return {
         "min": float(finite.min()),
         "max": float(finite.max()),
@@ -140,6 +144,11 @@ def hints(cloud: GaussianCloud) -> list[Hint]:
     if len(cloud) == 0:
         return [Hint("empty", "the file holds no splats")]
     found = []
+    invalid = locate_invalid(cloud)
+    if invalid:
+        counts = {cause: count for cause, (count, _) in invalid.items()}
+        causes = counts_in_words(counts)
+        found.append(Hint("invalid", f"{sum(counts.values())} splats are invalid, converting drops them: {causes}"))
     finite_scales = cloud.log_scales[np.isfinite(cloud.log_scales)]
     if finite_scales.size and finite_scales.min() >= 0:
         found.append(

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.constants import VISIBLE_OPACITY
-from gsplat_tools.errors import CapabilityError, FormatError
+from gsplat_tools.errors import CapabilityError, FormatError, counts_in_words
 from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats._issues import Issue, Rule
 from gsplat_tools.formats.base import Format
@@ -131,19 +131,21 @@ def _issues(stream: BinaryIO, record: Format) -> Iterator[Issue]:
 def _remarks(cloud: GaussianCloud, frame: int | None) -> Iterator[Issue]:
     """Yield what any scene may suffer from, whatever its format."""
     from gsplat_tools.attributes.activations import sigmoid
-    from gsplat_tools.ops.filtering import classify_invalid
+    from gsplat_tools.ops.filtering import locate_invalid
 
     if len(cloud) == 0:
         yield Issue(code="no-splats", message="the file holds no splats", frame=frame)
         return
-    keeps, dropped = classify_invalid(cloud)
-    for cause, count in dropped.items():
+    invalid = locate_invalid(cloud)
+    causes = counts_in_words({cause: count for cause, (count, _) in invalid.items()})
+    where = "" if frame is None else f" in frame {frame}"
+    for cause, (count, first) in invalid.items():
         yield Issue(
             code="invalid-splats",
-            message=f"{count} splats are invalid ({cause}); converting drops them",
+            message=f"splats{where} are invalid and dropped by converting: {causes}",
             field=cause,
             frame=frame,
-            splat=int(np.argmin(keeps)),
+            splat=first,
             count=count,
         )
     hidden = sigmoid(cloud.opacity_logits) < VISIBLE_OPACITY

@@ -53,6 +53,15 @@ def classify_invalid(cloud: GaussianCloud) -> tuple[NDArray[np.bool_], dict[str,
     return codes == 0, {cause: int(count) for cause, count in zip(CAUSES, counts, strict=True) if count}
 
 
+def locate_invalid(cloud: GaussianCloud) -> dict[str, tuple[int, int]]:
+    """Return (number of splats, index of the first) per cause, in the order of CAUSES; empty where all are valid."""
+    codes = _codes(cloud)
+    if codes is None:
+        return {}
+    found = {cause: codes == code for cause, code in _CODES.items()}
+    return {cause: (int(np.count_nonzero(mask)), int(np.argmax(mask))) for cause, mask in found.items() if mask.any()}
+
+
 def drop_invalid(cloud: GaussianCloud) -> tuple[GaussianCloud, dict[str, int]]:
     """Return the valid splats and the number of others per cause; the same cloud where all are valid."""
     keeps, dropped = classify_invalid(cloud)
