@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from gsplat_tools.attributes import covariance, quaternions
 
@@ -38,3 +39,30 @@ def test_triangles__and_matrices_are_the_same_numbers() -> None:
 
     np.testing.assert_array_equal(matrices[0], [[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     np.testing.assert_array_equal(covariance.to_triangles(matrices), triangles)
+
+
+def test_decompose__gives_back_covariances_and_sorted_scales(rng: np.random.Generator) -> None:
+    quats, log_scales = rng.normal(size=(500, 4)), rng.uniform(-6, 3, (500, 3))
+    triangles = covariance.covariance_triangles(quats, log_scales, dtype=np.float64)
+
+    found_quats, found_scales = covariance.decompose(triangles)
+    back = covariance.covariance_triangles(found_quats, found_scales, dtype=np.float64)
+
+    assert np.abs(found_scales - np.sort(log_scales, axis=1)).max() < 1e-5
+    assert np.linalg.norm(found_quats, axis=1) == pytest.approx(np.ones(500), abs=1e-6)
+    assert (np.abs(back - triangles).max(axis=1) <= 4e-6 * np.abs(triangles).max(axis=1)).all()
+
+
+def test_decompose__of_flat_tiny_and_broken_covariances() -> None:
+    triangles = np.array(
+        [[4, 0, 0, 1, 0, 0], [1, 0, 0, 1, 0, -0.5], [0, 0, 0, 0, 0, 0], [1e-44, 0, 0, 1e-44, 0, 1e-44], [np.inf, 0, 0, 1, 0, 1]]
+    )
+
+    quats, log_scales = covariance.decompose(triangles)
+
+    assert log_scales[0] == pytest.approx([-np.inf, 0, np.log(2)])
+    assert log_scales[1] == pytest.approx([-np.inf, 0, 0])
+    assert np.isneginf(log_scales[2]).all()
+    assert log_scales[3] == pytest.approx([0.5 * np.log(1e-44)] * 3)
+    assert np.isnan(log_scales[4]).all()
+    assert np.isfinite(quats).all()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gsplat_tools.attributes.covariance import covariance_triangles
 from gsplat_tools.codecs import visionary_buffers as buffers
 
 SCALARS = [1.0, -2.0, 0.5, 0.25, 0.125, 3.0, -4.0, 6.0, 8.0, -0.75]
@@ -164,3 +165,18 @@ def test_half_error__bounds_the_conversion_and_is_reached(rng: np.random.Generat
 
     assert 0.99 < shares.max() <= 1
     assert buffers.half_error(np.array([65520.0, -1e6])).tolist() == [np.inf, np.inf]
+
+
+def test_count_lost_needles__agrees_with_the_eigenvalues(rng: np.random.Generator) -> None:
+    quats = rng.normal(size=(3000, 4)).astype(np.float32)
+    log_scales = rng.uniform(-9, 1, (3000, 3)).astype(np.float32)
+    log_scales[:50, 0] = -np.inf
+    log_scales[50:60] = 6.0  # overflows
+    log_scales[60:70] = -12.0  # vanishes as a whole
+
+    covariances = covariance_triangles(quats, log_scales, dtype=np.float64)
+    expected = buffers.half_covariance_losses(covariances).vanished
+
+    assert expected > 500
+    # Covariances are rounded twice, as Visionary's loaders do: one in a few thousand falls on the other side.
+    assert buffers.count_lost_needles(quats, log_scales) == pytest.approx(expected, abs=3)

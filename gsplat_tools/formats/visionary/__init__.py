@@ -54,6 +54,7 @@ def _record(precision: Precision, title: str) -> Format:
         bounds=partial(buffers.bounds, precision=precision),
         min_splats=1,
         stores_origin=True,
+        precise=precision == "f32",
         streams=True,
         position_type=precision,
         write_options=BufferOptions,
@@ -82,6 +83,7 @@ FORMATS = (
         position_type="fixed",
         write_options=Int8Options,
         presets={"fast": {"clip": 0.0}, "balanced": {}, "best": {}},
+        knobs={"position_bits": (8, 16)},
         model=("visionary", None),
     ),
 )
