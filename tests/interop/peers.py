@@ -62,10 +62,15 @@ def _node() -> str:
     return found
 
 
+def splat_transform_command() -> list[str]:
+    """The command without a GPU; paths are missing."""
+    return [_node(), str(_module("@playcanvas/splat-transform") / "bin" / "cli.mjs"), "-w", "-g", "cpu"]
+
+
 def splat_transform(*arguments: str | Path) -> None:
     """Run splat-transform without a GPU."""
-    command = [_node(), str(_module("@playcanvas/splat-transform") / "bin" / "cli.mjs"), "-q", "-w", "-g", "cpu"]
-    done = subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, check=False, timeout=120)
+    command = [*splat_transform_command(), "-q", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr[-500:]
 
 
