@@ -54,29 +54,79 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     with _explained(path):
         target = _find_target(path, overwrite=overwrite)
         sweep_stale(target)
+    with temporary_beside(target) as stream:
+        temporary = Path(stream.name)
+        try:
+            yield stream
+            with _explained(path):
+                _copy_mode(target, temporary)
+                read_back(stream, path)
+                if os.name != "posix":
+                    stream.close()  # an open file cannot be renamed there; elsewhere its lock keeps sweepers away
+                with published(temporary, target):
+                    _publish(temporary, target, overwrite=overwrite)
+                _sync_folder(target.parent)
+        finally:
+            remove_beside(temporary)
+
+
+@contextmanager
+def temporary_beside(target: Path) -> Iterator[BinaryIO]:
+    """Open a temporary file in the folder of a target, that is gone when the block ends."""
+    with _explained(target):
         raw = _create_temporary(target)
-    temporary = Path(raw.name)
     stream = io.BufferedRandom(raw, _BUFFER_BYTES)
     try:
         yield stream
-        with _explained(path):
-            stream.flush()
-            _copy_mode(target, raw)
-            os.fsync(raw.fileno())
-            _read_back(raw, path)
-            if os.name != "posix":
-                stream.close()  # an open file cannot be renamed there; elsewhere its lock keeps sweepers away
-            with published(temporary, target):
-                _publish(temporary, target, overwrite=overwrite)
-            stream.close()
-            _sync_folder(target.parent)
     finally:
-        # What could not be written stays in the buffer; closing tries once more.
+        # What could not be written stays in the buffer, and closing tries once more.
         with suppress(OSError, ValueError):
             stream.close()
         with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        remove_beside(temporary)
+            Path(raw.name).unlink(missing_ok=True)
+
+
+def read_back(stream: BinaryIO, path: Path) -> None:
+    """Bring a temporary file to the disk, and hold it against what was written to it.
+
+    Raises
+    ------
+    WriteError
+        It does not hold what was written.
+    """
+    stream.flush()
+    os.fsync(stream.fileno())
+    assert isinstance(stream, io.BufferedRandom)
+    assert isinstance(stream.raw, RecordedFile)
+    offset = stream.raw.first_difference()
+    if offset is not None:
+        raise WriteError(
+            "what was written does not read back the same: the disk, or the connection to it, is failing, or another program "
+            "changed the file; the target is left as it was",
+            path=path,
+            offset=offset,
+        )
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other writers that ask for it out of a folder, where there are locks."""
+    if os.name != "posix":
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def target_of(temporary: str) -> str | None:
+    """Return the name of the target that the name of a temporary file belongs to, or None for other names."""
+    match = re.fullmatch(rf"\.(.+)\.\d+\.[0-9a-z_]+{re.escape(_SUFFIX)}", temporary)
+    return match[1] if match else None
 
 
 def sweep_stale(path: Path) -> None:
@@ -184,22 +234,10 @@ def _create_temporary(target: Path) -> RecordedFile:
         raw.close()  # someone swept it between the two calls
 
 
-def _copy_mode(target: Path, raw: RecordedFile) -> None:
+def _copy_mode(target: Path, temporary: Path) -> None:
     """Give the new file the permissions of the old one."""
     with suppress(FileNotFoundError):
-        Path(raw.name).chmod(target.stat().st_mode & 0o7777)
-
-
-def _read_back(raw: RecordedFile, path: Path) -> None:
-    """Refuse a file that does not hold what was written to it."""
-    offset = raw.first_difference()
-    if offset is not None:
-        raise WriteError(
-            "what was written does not read back the same: the disk, or the connection to it, is failing, or another program "
-            "changed the file; the target is left as it was",
-            path=path,
-            offset=offset,
-        )
+        temporary.chmod(target.stat().st_mode & 0o7777)
 
 
 def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from tempfile import NamedTemporaryFile
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
-from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.formats._atomic import locked, read_back, replacing, sweep_stale, target_of, temporary_beside
 from gsplat_tools.formats.base import FolderLayout
 
 
@@ -46,33 +46,62 @@ def replacing_folder(path: Path, layout: FolderLayout, *, overwrite: bool) -> It
     if makes_folder:
         path.parent.mkdir()
     placed: list[Path] = []
-    try:
-        before = _files_of(path, layout)
-        # What is entered first is published last: the index.
-        with replacing(path, overwrite=overwrite) as index, ExitStack() as files, NamedTemporaryFile() as bundle:
-            yield cast("BinaryIO", bundle)
-            bundle.seek(0)
+    wanted: set[str] = set()
+    with ExitStack() as lock:
+        try:
+            # What is entered first is published last: the index.
+            with replacing(path, overwrite=overwrite) as index, ExitStack() as files, temporary_beside(path) as bundle:
+                yield bundle
+                read_back(bundle, path)
+                bundle.seek(0)
+                # From here on another writer could take a file of the old index for its own while that is removed.
+                lock.enter_context(locked(path.parent))
+                before = _files_of(path, layout)
 
-            def take(name: str, data: bytes) -> str:
-                final = path.with_name(name)
-                if final.exists() and final.read_bytes() != data:
-                    final = final.with_stem(f"{final.stem}.{hashlib.sha256(data).hexdigest()[:12]}")
-                if not final.exists():
-                    files.enter_context(_placing(final, placed)).write(data)
-                return final.name
+                def take(name: str, data: bytes) -> str:
+                    wanted.add(name)
+                    final = path.with_name(name)
+                    if final.exists() and final.read_bytes() != data:
+                        final = final.with_stem(f"{final.stem}.{_digest(data)}")
+                    if not final.exists():
+                        files.enter_context(_placing(final, placed)).write(data)
+                    return final.name
 
-            index.write(layout.unpack(cast("BinaryIO", bundle), take))
-    except BaseException:
-        for file in placed:
-            with suppress(OSError):
-                file.unlink()
-        if makes_folder:
-            with suppress(OSError):
-                path.parent.rmdir()
-        raise
-    for file in before - _files_of(path, layout):
+                index.write(layout.unpack(bundle, take))
+        except BaseException:
+            _remove(set(placed) - _files_of(path, layout))
+            if makes_folder:
+                with suppress(OSError):
+                    path.parent.rmdir()
+            raise
+        _remove((before | _abandoned(path.parent, wanted)) - _files_of(path, layout))
+
+
+def _digest(data: bytes) -> str:
+    """Return what is put into the name of a file whose own name is taken."""
+    return hashlib.sha256(data).hexdigest()[:12]
+
+
+def _remove(files: set[Path]) -> None:
+    """Remove files as far as that is possible."""
+    for file in files:
         with suppress(OSError):
             file.unlink()
+
+
+def _abandoned(folder: Path, wanted: set[str]) -> set[Path]:
+    """Return files that killed writers placed under a name made from their content; sweep their temporaries."""
+    found = set()
+    for entry in list(folder.iterdir()):
+        owner = target_of(entry.name)
+        path = folder / (owner or entry.name)
+        stem, _, digest = path.stem.rpartition(".")
+        is_version = re.fullmatch("[0-9a-f]{12}", digest) is not None and path.with_stem(stem or "_").name in wanted
+        if owner is not None and (is_version or owner in wanted):
+            sweep_stale(path)
+        elif owner is None and is_version and _digest(path.read_bytes()) == digest:
+            found.add(path)
+    return found
 
 
 @contextmanager
