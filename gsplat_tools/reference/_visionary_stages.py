@@ -163,10 +163,10 @@ def _center(cloud: GaussianCloud, camera: Camera, matrix: NDArray[np.float64]) -
     """Return where the camera lies among the means: float32 keeps more of a scene far from zero once it is about there."""
     position = camera.position - matrix[:3, :3] @ cloud.origin - matrix[:3, 3]
     try:
-        center = np.linalg.solve(matrix[:3, :3], position)
+        center: NDArray[np.float64] = np.linalg.solve(matrix[:3, :3], position).astype(np.float64)
     except np.linalg.LinAlgError:
         return np.zeros(3)
-    return center if np.isfinite(center).all() else np.zeros(3)
+    return center if bool(np.isfinite(center).all()) else np.zeros(3)
 
 
 def _uniforms(

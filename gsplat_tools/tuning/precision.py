@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, BinaryIO, Literal
 
 from gsplat_tools.cloud import GaussianCloud
@@ -157,7 +157,7 @@ def choose_clip(
 
 def _stored(cloud: GaussianCloud, record: Format, options: dict[str, Any]) -> tuple[GaussianCloud, BinaryIO, int]:
     """Return a cloud as a format gives it back, the stream that it is in, and its size."""
-    known = record.write_options.__dataclass_fields__
+    known = {option.name for option in fields(record.write_options)}
     assert record.write is not None
     assert record.read is not None
     stream = io.BytesIO()

@@ -12,6 +12,7 @@ from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.codecs.visionary_buffers import MAX_SH_DEGREE, Precision
 from gsplat_tools.formats.base import Format
+from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.formats.visionary import buffers, int8
 from gsplat_tools.formats.visionary.buffers import BufferOptions
 from gsplat_tools.formats.visionary.int8 import Int8Options
@@ -59,6 +60,7 @@ def _record(precision: Precision, title: str) -> Format:
         position_type=precision,
         write_options=BufferOptions,
         presets={"fast": {}, "balanced": {}, "best": {}},
+        knobs=general_knobs(MAX_SH_DEGREE),
         model=("visionary", None),
     )
 
@@ -83,7 +85,7 @@ FORMATS = (
         position_type="fixed",
         write_options=Int8Options,
         presets={"fast": {"clip": 0.0}, "balanced": {}, "best": {}},
-        knobs={"position_bits": (8, 16)},
+        knobs={**general_knobs(MAX_SH_DEGREE), "position_bits": Knob(values=(8, 16), stream="positions")},
         model=("visionary", None),
     ),
 )
