@@ -18,7 +18,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import AttributeTally, compare_rendered, paired, sample
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, ValidationError
 from gsplat_tools.formats.base import Format, Scene
-from gsplat_tools.formats.loading import inspect_file, open_scene
+from gsplat_tools.formats.loading import inspect_file, is_single, open_scene
 from gsplat_tools.formats.preparing import Prepared
 from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, save
 from gsplat_tools.progress import stage
@@ -196,7 +196,7 @@ def _open(
 ) -> Iterator[tuple[Scene, str]]:
     """Open one file, or several, a folder or a glob as a sequence; yield it and the id of its format."""
     found: list[Format] = []
-    if len(sources) == 1 and Path(sources[0]).is_file():
+    if len(sources) == 1 and is_single(Path(sources[0])):
         with open_scene(Path(sources[0]), in_chunks=in_chunks, on_format=found.append, **read_options) as scene:
             yield scene, found[0].id
         return

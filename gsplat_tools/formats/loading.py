@@ -14,6 +14,7 @@ from typing import Any, BinaryIO, TypeVar, cast
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, UnknownFormatError, counts_in_words
+from gsplat_tools.formats._files import open_source_file
 from gsplat_tools.formats._stream import seekable
 from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format, Scene
 from gsplat_tools.formats.registry import detect, find_format
@@ -33,12 +34,20 @@ def located(path: Path) -> Iterator[None]:
         raise
 
 
+def is_single(path: Path) -> bool:
+    """Whether a path is one file or pipe, not a folder, a pattern or a device."""
+    return path.is_file() or path.is_fifo()
+
+
 def open_source(path: Path) -> tuple[BinaryIO, Format]:
     """Open a file and find its format from its first bytes, then from its name; the caller closes it."""
-    if path.exists() and not path.is_file():
-        raise UnknownFormatError("this is not a regular file; give a file, or frames in a folder to gsplat-convert", path=path)
-    stream = seekable(path.open("rb"))
+    if path.exists() and not is_single(path):
+        raise UnknownFormatError("this is no file and no pipe; give a file, or frames in a folder to gsplat-convert", path=path)
+    stream = open_source_file(path)
     try:
+        if not stream.seekable():
+            with stream as pipe:
+                stream = seekable(pipe)
         head = stream.read(SNIFF_BYTES)
         stream.seek(0)
         return stream, detect(head, path)
@@ -164,7 +173,7 @@ def open_scene(
         if as_format is None:
             stream, record = open_source(path)
         else:
-            stream, record = path.open("rb"), find_format(as_format)
+            stream, record = open_source_file(path), find_format(as_format)
         with stream:
             if on_format is not None:
                 on_format(record)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsplat_tools.chunks import CloudChunks
-from gsplat_tools.errors import CapabilityError
+from gsplat_tools.errors import CapabilityError, FormatError, GsplatWarning, WriteError
 from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats._folder import folder_size, replacing_folder
 from gsplat_tools.formats._stream import stream_size
@@ -39,7 +40,7 @@ class SaveReport:
     dropped
         Splats left out, per cause; each counted once.
     seconds
-        Time spent in "read" (reading and preparing the source), "encode", and "write" (sync and rename).
+        Time spent in "read" (reading and preparing the source), "encode", and "write" (sync, reading back, rename).
     options
         Every write option as it was used.
     """
@@ -113,6 +114,30 @@ def split_options(record: Format, preset: str, options: dict[str, Any]) -> tuple
     return choices, record.write_options(**{name: value for name, value in chosen.items() if name in own})
 
 
+def check_header(stream: BinaryIO, record: Format, scene: Scene) -> None:
+    """Hold the header and the tables of a finished file against its size and the scene; no splat is decoded.
+
+    Raises
+    ------
+    WriteError
+        They do not agree.
+    """
+    stream.seek(0)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GsplatWarning)
+            info = record.inspect(stream)
+    except FormatError as error:
+        message = f"what was written cannot be read back ({error.message}); the target is left as it was"
+        raise WriteError(message, offset=error.offset, field=error.field) from error
+    expected = count_splats(scene), len(scene) if isinstance(scene, GaussianSequence) else 1
+    if (info.splats, info.frames if record.holds_sequences else 1) != expected:
+        raise WriteError(
+            f"{expected[0]} splats in {expected[1]} frames were written, but the file says {info.splats} in {info.frames}; "
+            "the target is left as it was"
+        )
+
+
 def save(
     scene: Scene,
     path: str | Path,
@@ -155,6 +180,8 @@ def save(
         `strict` and there are invalid splats.
     TargetExistsError
         The target is there and `overwrite` is false.
+    WriteError
+        The operating system refused to write, or what was written does not read back the same.
 
     Warns
     -----
@@ -175,6 +202,7 @@ def save(
         record.write(prepared.scene, stream, write_options)
         stream.flush()
         size = stream_size(stream)
+        check_header(stream, record, prepared.scene)
         written_at = time.perf_counter()
         if check is not None:
             stream.seek(0)
