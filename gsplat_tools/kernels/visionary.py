@@ -3,10 +3,13 @@
 Source: preprocess.wgsl of Visionary-Laboratory/visionary @ c5d7070; steps in the order of docs/visionary.md.
 """
 
+import math
+
 import numpy as np
 
 from gsplat_tools.kernels import rules as R
 from gsplat_tools.kernels._jit import device, kernel
+from gsplat_tools.kernels.half_floats import round_to_half
 
 # UNIFORMS: camera and model, in the space of the means
 VIEW = 0  # 12 numbers: rows of view times model, each followed by its translation
@@ -72,6 +75,74 @@ def _fill_normal(xx, xy, xz, yy, yz, zz, values):
     values[VAL_COLOR] = min(max(half * (sign * x + one), zero), one)
     values[VAL_COLOR + 1] = min(max(half * (sign * y + one), zero), one)
     values[VAL_COLOR + 2] = min(max(half * (sign * z + one), zero), one)
+
+
+@kernel()
+def activate(means, center, log_scales, quats, opacity_logits, weights, is_single, start, stop, splats):
+    """Turn stored values into splats with covariances about a center; colors are left out.
+
+    means           float (N, 3)    read
+    center          float64 (3,)    read; subtracted in float64
+    log_scales      float32 (N, 3)  read
+    quats           float32 (N, 4)  read, wxyz; of norm 0: the splat becomes NaN
+    opacity_logits  float32 (N,)    read
+    weights         float (N,)      read; factor of the opacity. Empty: 1
+    is_single       bool            opacities and covariances are rounded to float32, as buffers hold them
+    start, stop     int             range of splats
+    splats          float (stop - start, SPLAT_SIZE)  written, but for the colors
+    """
+    f = splats.dtype.type
+    halves = np.empty((3, 3), np.float64)
+    for i in range(start, stop):
+        row = i - start
+        w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = w / norm, x / norm, y / norm, z / norm
+        sx, sy, sz = (
+            math.exp(np.float64(log_scales[i, 0])),
+            math.exp(np.float64(log_scales[i, 1])),
+            math.exp(np.float64(log_scales[i, 2])),
+        )
+        halves[0, 0], halves[0, 1], halves[0, 2] = (
+            (1.0 - 2.0 * (y * y + z * z)) * sx,
+            2.0 * (x * y - w * z) * sy,
+            2.0 * (x * z + w * y) * sz,
+        )
+        halves[1, 0], halves[1, 1], halves[1, 2] = (
+            2.0 * (x * y + w * z) * sx,
+            (1.0 - 2.0 * (x * x + z * z)) * sy,
+            2.0 * (y * z - w * x) * sz,
+        )
+        halves[2, 0], halves[2, 1], halves[2, 2] = (
+            2.0 * (x * z - w * y) * sx,
+            2.0 * (y * z + w * x) * sy,
+            (1.0 - 2.0 * (x * x + y * y)) * sz,
+        )
+        column = COVARIANCE
+        for a in range(3):
+            for b in range(a, 3):
+                entry = halves[a, 0] * halves[b, 0] + halves[a, 1] * halves[b, 1] + halves[a, 2] * halves[b, 2]
+                splats[row, column] = f(np.float32(entry)) if is_single else f(entry)
+                column += 1
+        for c in range(3):
+            splats[row, R.MEAN + c] = f(np.float64(means[i, c]) - center[c])
+        opacity = 1.0 / (1.0 + math.exp(-np.float64(opacity_logits[i])))
+        if is_single:
+            opacity = np.float64(np.float32(opacity))
+        splats[row, R.OPACITY] = f(opacity) if len(weights) == 0 else f(opacity) * f(weights[i])
+
+
+@kernel()
+def round_values(values):
+    """Round the values of records to what their halves hold; the depth stays.
+
+    values  float (M, VALUES_SIZE)  read and written
+    """
+    f = values.dtype.type
+    for i in range(len(values)):
+        for c in range(VALUES_SIZE):
+            if c != VAL_POSZ:
+                values[i, c] = f(round_to_half(values[i, c]))
 
 
 @kernel()

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gsplat_tools import parallel
-from gsplat_tools.attributes.activations import sigmoid
-from gsplat_tools.attributes.covariance import covariance_triangles
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.codecs import visionary_buffers
 from gsplat_tools.codecs.visionary_buffers import Precision, ShLayout
@@ -222,20 +220,26 @@ def _decoded_splats(
 
     dtype = eye.dtype
     precision: Precision | None = None if settings.precision == "exact" else settings.precision
-    # Overflow becomes infinity, which is counted as invalid.
-    with np.errstate(over="ignore", invalid="ignore"):
-        covariances = covariance_triangles(part.quats, part.log_scales, dtype=np.float32 if precision else dtype)
-    covariances[~part.quats.any(axis=1)] = np.nan
-    opacities = sigmoid(part.opacity_logits.astype(np.float32 if precision else dtype, copy=False))
-    if weights is not None:
-        opacities = opacities * weights
-    if precision is not None:
-        words = visionary_buffers.encode_gaussians(means, opacities, covariances, precision=precision)
-        means, opacities, covariances = visionary_buffers.decode_gaussians(words, precision=precision)
     splats = np.empty((len(part), R.SPLAT_SIZE), dtype)
-    splats[:, R.MEAN : R.MEAN + 3] = means - center
-    splats[:, kernel.COVARIANCE : kernel.COVARIANCE + 6] = covariances
-    splats[:, R.OPACITY] = opacities
+    factors = np.empty(0, dtype) if weights is None else weights
+    is_half = precision == "f16"
+    kernel.activate(
+        means,
+        np.zeros(3) if is_half else center,
+        part.log_scales,
+        part.quats,
+        part.opacity_logits,
+        factors,
+        precision is not None,
+        0,
+        len(part),
+        splats,
+    )
+    if is_half:
+        covariances = slice(kernel.COVARIANCE, kernel.COVARIANCE + 6)
+        words = visionary_buffers.encode_gaussians(splats[:, R.MEAN : R.MEAN + 3], splats[:, R.OPACITY], splats[:, covariances])
+        stored_means, splats[:, R.OPACITY], splats[:, covariances] = visionary_buffers.decode_gaussians(words)
+        splats[:, R.MEAN : R.MEAN + 3] = stored_means - center
     sh0, shN = part.sh0, part.shN[:, : (degree + 1) ** 2 - 1]
     if settings.raw_color:
         colors: NDArray[Any] = part.sh0 * np.float32(SH_C0) + np.float32(0.5)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gsplat_tools import parallel
 from gsplat_tools.reference import models
 from gsplat_tools.reference._stages import Projection, compose_image, draw_splats
-from gsplat_tools.reference._visionary_stages import RECORD, Settings, pack_records, preprocess_scene, unpack_records
+from gsplat_tools.reference._visionary_stages import RECORD, Settings, preprocess_scene, unpack_records
 from gsplat_tools.reference.camera import Camera
 from gsplat_tools.reference.models import Model
 from gsplat_tools.reference.motion import SceneState
@@ -103,6 +103,8 @@ def project_state(
     tuple
         Projection of the K records · which of them to draw, in drawing order · (N,) states of the splats.
     """
+    from gsplat_tools.kernels.visionary import round_values
+
     settings = Settings(
         kernel_size=model.low_pass,
         sh_degree=None if sh_degree is None else min(sh_degree, model.max_sh_degree),
@@ -110,7 +112,10 @@ def project_state(
         mip=model.compensation != "none",
     )
     found = preprocess_scene(state, camera, settings, dtype)
-    values = unpack_records(pack_records(found.values), dtype) if model.half_records else found.values
+    values = found.values
+    if model.half_records:
+        # The numbers of `pack_records`, without their bytes.
+        parallel.run_blocks(lambda start, stop: round_values(values[start:stop]), len(values))
     projection = _place(values, camera, model)
     ids, shows = found.splat_ids, _shows(projection)
     states = found.states.copy()

@@ -259,8 +259,9 @@ def test_f16__loses_small_covariances_and_overflows_large_ones() -> None:
 
 
 def test_invalid_splats__are_left_out_and_counted() -> None:
-    cloud = hand.splats([[0, 0, 2.0]] * 5)
+    cloud = hand.splats([[0, 0, 2.0]] * 6)
     broken = {name: values.copy() for name, values in cloud.arrays().items()}
+    broken["quats"][5] = 0
     broken["means"][0, 0] = np.nan
     broken["log_scales"][1, 0] = np.inf
     broken["opacity_logits"][2] = np.nan
@@ -269,7 +270,7 @@ def test_invalid_splats__are_left_out_and_counted() -> None:
     found = preprocess(GaussianCloud(**broken), hand.camera())
 
     assert found.splat_ids.tolist() == [4]
-    assert found.invalid == 4
+    assert found.invalid == 5
 
 
 def test_channel_major__gives_the_records_of_interleaved() -> None:

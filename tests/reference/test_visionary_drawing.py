@@ -10,8 +10,9 @@ import pytest
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.reference.camera import Camera
 from gsplat_tools.reference.rasterizer import render
-from gsplat_tools.reference.visionary import preprocess, sort_records
+from gsplat_tools.reference.visionary import merge_models, preprocess, sort_records
 from gsplat_tools.reference.visionary_drawing import draw_records
+from tests.clouds import random_cloud
 from tests.oracles import oracle_projection, scenes, visionary
 from tests.reference import splats as hand
 
@@ -90,3 +91,34 @@ def test_draw_records__refuses_what_no_option_means(options: dict[str, Any]) -> 
     view = hand.camera()
     with pytest.raises(ValueError, match=next(iter(options))):
         draw_records(preprocess(hand.splats([0, 0, 2]), view), view, **options)
+
+
+@pytest.mark.parametrize("count", [0, 1, 400])
+def test_render__is_the_picture_of_the_records_to_the_bit(count: int) -> None:
+    cloud, view = random_cloud(count), _camera(scenes.camera())
+
+    image, alphas = draw_records(preprocess(cloud, view), view)
+    expected = render(cloud, view, model="visionary")
+
+    assert image.tobytes() == expected.image.tobytes()
+    assert alphas.tobytes() == expected.alphas.tobytes()
+
+
+def test_draw_records__of_merged_models_is_the_picture_of_all_splats() -> None:
+    cloud, view = random_cloud(300, sh_degree=1), _camera(scenes.camera())
+    parts = [preprocess(cloud.take(slice(*ends)), view) for ends in ((0, 120), (120, 120), (120, 300))]
+
+    merged, whole = merge_models(parts), preprocess(cloud, view)
+
+    assert merged.records.tobytes() == whole.records.tobytes()
+    for name in ("keys", "payload", "splat_ids"):
+        assert np.array_equal(getattr(merged, name), getattr(whole, name)), name
+    assert merged.counters == whole.counters
+    assert merged.culled == whole.culled
+    assert draw_records(merged, view)[0].tobytes() == draw_records(whole, view)[0].tobytes()
+
+
+def test_merge_models__of_nothing_is_an_empty_frame() -> None:
+    merged = merge_models([])
+
+    assert len(merged.records) == merged.counters.dispatch_x == 0
