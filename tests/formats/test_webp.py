@@ -94,3 +94,11 @@ def test_damage__is_refused_or_read_and_nothing_else() -> None:
 def test_effort__is_checked() -> None:
     with pytest.raises(ValueError, match="0 to 9"):
         encode_rgba(picture(), 10)
+
+
+def test_default_effort__finds_what_repeats_two_hundred_rows_later() -> None:
+    rows = np.random.default_rng(0).integers(0, 256, (200, 48, 4), np.uint8)
+
+    once, twice = (len(encode_rgba(np.ascontiguousarray(np.tile(rows, (count, 1, 1))))) for count in (1, 2))
+
+    assert twice < 1.1 * once
