@@ -14,9 +14,14 @@ from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog4d.bundle import Bundle
 from gsplat_tools.formats.sog4d.meta import frame_path
 from gsplat_tools.formats.sog4d.textures import indices_of, pixels_of
+from gsplat_tools.ops.visibility import MAX_TURN, MOST
 
 _ROUNDING = 2.0**-22
 """Relative slack for float32 results: two units in the last place."""
+
+_ARCSINE = float(np.arcsin(MAX_TURN) / MAX_TURN) * (1 + 1e-6)
+
+_LABEL_SLACK = 1e-5
 
 _LOG_SLACK = 1e-5
 """Slack for logarithms in float32, of scales that are text with a few digits."""
@@ -55,20 +60,55 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
     means = (high - low) / 65535 / 2 + np.maximum(np.abs(low), np.abs(high)) * _ROUNDING
     entries = meta.sh0_codebook[nearest_entry(source.sh0, meta.sh0_codebook)]
     sh0 = np.abs(entries - source.sh0.astype(np.float64)) + np.abs(source.sh0) * _ROUNDING + np.float32(1e-30)
+    opacities: Any = 0.5 / 255
     codes = pixels_of(bundle.image(frame_path(meta.rotation_path, frame), frame), len(source))
     indices = indices_of(bundle.image(frame_path(meta.scale_indices_path, frame), frame), len(source))
-    least, largest = scale_reach(
-        source.log_scales, meta.scale_codebook, indices, source_axes(source.quats, codes), is_first=frame == 0
-    )
+    axes = source_axes(source.quats, codes)
+    turned = extra = None
+    if meta.tolerance is not None:
+        costs = meta.tolerance.costs(source, source.log_scales)
+        means = np.maximum(means, allowed_error(costs.position)[:, None] + np.maximum(np.abs(low), np.abs(high)) * _ROUNDING)
+        opacities = np.maximum(opacities, allowed_error(costs.opacity))
+        sh0 = np.maximum(sh0, allowed_error(costs.color)[:, None] * (1 + _ROUNDING))
+        extra = MOST / costs.scale * (1 + _LABEL_SLACK)  # labels are chosen in float32
+        turned = turned_share(source.log_scales, costs.rotation)
+    least, largest = scale_reach(source.log_scales, meta.scale_codebook, indices, axes, is_first=frame == 0, extra=extra)
     logs = source.log_scales.astype(np.float64)
+    covariances = covariance_bound_of_ranges(logs, least, largest, rotation_bound(codes)) + _ROUNDING
+    if turned is not None:  # a rotation was rounded, or moved as far as shows no more than it may
+        covariances = np.maximum(covariances, covariance_bound_of_ranges(logs, least, largest, 0.0) + turned + _ROUNDING)
     return {
         "means": np.broadcast_to(means, source.means.shape),
-        "opacities": np.full(len(source), 0.5 / 255 + _ROUNDING),
+        "opacities": np.broadcast_to(opacities + _ROUNDING, len(source)),
         "sh0": sh0,
         # Sorted values lie between the sorted ends of their intervals.
         "scales": _distance(np.sort(logs, axis=1), np.sort(least, axis=1), np.sort(largest, axis=1)),
-        "covariances": covariance_bound_of_ranges(logs, least, largest, rotation_bound(codes)) + _ROUNDING,
+        "covariances": covariances,
     }
+
+
+def allowed_error(costs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest change that a visual tolerance allows beyond rounding, from its cost per square."""
+    allowed: NDArray[np.float64] = np.sqrt(MOST / costs) * (1 + _ROUNDING)
+    return allowed
+
+
+def turned_share(log_scales: NDArray[np.float32], costs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much of its norm a covariance may change by a turn that costs no more than `MOST`, (N,).
+
+    Notes
+    -----
+    Turning L by the angle vector t moves it by at most sqrt(2 sum_k (l_i - l_j)^2 t_k^2), i and j the axes other than k: its
+    derivative along the turn keeps that norm. Encoders hold sum_k cost_k (2 u_k)^2 below `MOST`, u the vector part of the
+    turn's quaternion; t is longer than 2 u by the arcsine, at most 1.021 times up to `MAX_TURN`.
+    """
+    logs = log_scales.astype(np.float64)
+    longest = logs.max(axis=1, keepdims=True)
+    squares = np.exp(2 * (logs - np.where(np.isfinite(longest), longest, 0.0)))
+    norms = np.linalg.norm(squares, axis=1)
+    pairs = np.stack([squares[:, 1] - squares[:, 2], squares[:, 0] - squares[:, 2], squares[:, 0] - squares[:, 1]], axis=1)
+    share: NDArray[np.float64] = np.sqrt(2 * MOST * (np.square(pairs) / costs).max(axis=1)) * _ARCSINE
+    return share / np.where(norms > 0, norms, 1.0)
 
 
 def _distance(values: NDArray[np.float64], least: NDArray[np.float64], largest: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,6 +151,7 @@ def scale_reach(
     axes: NDArray[np.intp],
     *,
     is_first: bool,
+    extra: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the least and the largest logarithm that each scale may be decoded as, (N, 3) each, axes as in the source.
 
@@ -120,7 +161,8 @@ def scale_reach(
     from the codebook. Later frames may keep the label of the frame before, at a price of at most the mean squared error:
     such an entry lies within d of the source in every coordinate, so that m lies within a factor e^d, and a scale between
     e^(y-d) - a m e^d and e^(y+d) - a m e^-d. Nothing bounds its logarithm from below once the first of these is not
-    positive, or the coordinate is at the floor, where all thinner scales are the same.
+    positive, or the coordinate is at the floor, where all thinner scales are the same. `extra`, (N,), is the squared
+    distance that a visual tolerance allows beyond the nearest entry.
     """
     from gsplat_tools.codecs.palette import nearest_labels
     from gsplat_tools.formats.sog4d.codebooks import MIN_LOG, THIN, scale_coordinates
@@ -131,11 +173,12 @@ def scale_reach(
     points = scale_coordinates(np.take_along_axis(log_scales, axes, axis=1))
     nearest, squares = nearest_labels(points, entries)
     least = largest = logs_of_entries[nearest]
-    is_kept = np.zeros(len(points), np.bool_) if is_first else nearest != indices
+    is_kept = np.zeros(len(points), np.bool_) if is_first and extra is None else nearest != indices
     if is_kept.any():
         prices = np.square(points.astype(np.float64) - entries[indices]).sum(axis=1) - squares
-        allowed = min(float(prices[is_kept].max()), _price_of_keeping(log_scales, entries))
-        reach = np.sqrt(squares.astype(np.float64) + max(allowed, 0.0))[:, None] + 1e-6
+        allowed = 0.0 if is_first else max(0.0, min(float(prices[is_kept].max()), _price_of_keeping(log_scales, entries)))
+        prices_allowed = np.full(len(points), allowed) if extra is None else np.maximum(allowed, extra)
+        reach = np.sqrt(squares.astype(np.float64) + prices_allowed)[:, None] + 1e-6
         low, high = points - reach, points + reach
         longest = points.max(axis=1, keepdims=True) - np.log1p(THIN)
         # A longest axis at the floor may be stored as any thinner one.

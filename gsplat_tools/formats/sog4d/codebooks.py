@@ -12,7 +12,8 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CloudError
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
-from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, SH0_ENTRIES
+from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, MAX_CODEBOOK, SH0_ENTRIES
+from gsplat_tools.ops.visibility import MOST, Tolerance, viewpoint
 from gsplat_tools.parallel import run_blocks
 
 Float32 = NDArray[np.float32]
@@ -39,6 +40,9 @@ _PROBES = 8192
 _SCALE_GRID = 0.7
 _CENTROID_GRID = 0.5
 _FINE_STEP = 0.03
+
+_ENTRY_BITS = 40.0
+"""Of the text of a scale triple, deflated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +75,7 @@ class Shared:
     palettes: tuple[Palette, ...] = ()
     rotation_frames: NDArray[np.uint8] | None = None
     is_long: NDArray[np.bool_] | None = None
+    tolerance: Tolerance | None = None
     scale_points: Float32 = field(init=False)
 
     def __post_init__(self) -> None:
@@ -145,7 +150,12 @@ def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layo
     frames = None if options.rotation == "reference" else falling_frames(first)
     # Axes in the order in which frames put them: hardly any splat changes that order later in a sequence.
     log_scales = sample.log_scales if frames is None else -np.sort(-sample.log_scales, axis=1)
-    codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), len(first), options)
+    size = options.scale_codebook_size or int(options.detail * default_scale_size(len(first)))
+    codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), size)
+    tolerance = Tolerance(options.visual_tolerance, viewpoint(first)) if options.visual_tolerance > 0 else None
+    if tolerance is not None and options.scale_codebook_size is None:
+        size = _balanced_scale_size(codebook, first, turned(first, frames)[1], tolerance)
+        codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), size)
     return Shared(
         options=options,
         width=layout[0],
@@ -157,6 +167,7 @@ def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layo
         palettes=_fit_palettes(sample, first.sh_degree, len(first), options),
         rotation_frames=frames,
         is_long=long_splats(first) if options.rotation == "small" else None,
+        tolerance=tolerance,
     )
 
 
@@ -205,12 +216,28 @@ def turned(cloud: GaussianCloud, frames: NDArray[np.uint8] | None) -> tuple[Floa
     return quats, log_scales
 
 
-def _fit_scales(log_scales: Float32, weights: Float32, num_splats: int, options: Sog4dOptions) -> tuple[Float32, float]:
+def _balanced_scale_size(codebook: Float32, cloud: GaussianCloud, log_scales: Float32, tolerance: Tolerance) -> int:
+    """Return the size at which one more entry saves in what shows what it costs in bits.
+
+    Between them, N splats pay log2 K bits each for their label and the text of K entries; what shows falls as 1 / K.
+    """
+    from gsplat_tools.codecs.palette import nearest_labels
+
+    with np.errstate(divide="ignore"):
+        entries = scale_coordinates(np.log(codebook))
+    _, squares = nearest_labels(scale_coordinates(log_scales), entries)
+    shown = float(np.minimum(tolerance.costs(cloud, log_scales).scale * squares, MOST).sum())
+    # The root of a K^2 + b K = shown x size: the derivatives balance.
+    a, b = _ENTRY_BITS, len(cloud) / np.log(2)
+    size = (np.sqrt(b * b + 4 * a * shown * len(codebook)) - b) / (2 * a)
+    return int(np.clip(size, len(codebook) / 4, min(4 * len(codebook), MAX_CODEBOOK)).clip(1))
+
+
+def _fit_scales(log_scales: Float32, weights: Float32, size: int) -> tuple[Float32, float]:
     """Return the scale codebook as stored, and the mean squared error that it leaves."""
     from gsplat_tools.codecs.palette import fit_palette, nearest_labels
 
     points = scale_coordinates(log_scales)
-    size = options.scale_codebook_size or int(options.detail * default_scale_size(num_splats))
     centroids = fit_palette(points, weights, size=size, max_rounds=2)
     error = float(nearest_labels(points, centroids)[1].mean(dtype=np.float64))
     codebook = _on_grid(scales_at(centroids), _SCALE_GRID * np.sqrt(error / 3))

@@ -280,4 +280,5 @@ def _meta(
         sh0_codebook=shared.sh0_codebook,
         palettes=tuple(palettes),
         generator=f"{GENERATOR} {__version__}",
+        tolerance=shared.tolerance,
     )

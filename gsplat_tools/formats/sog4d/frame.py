@@ -12,6 +12,7 @@ from gsplat_tools.formats._webp import Image
 from gsplat_tools.formats.sog4d.codebooks import Shared, scale_coordinates, turned
 from gsplat_tools.formats.sog4d.labels import Labels
 from gsplat_tools.formats.sog4d.textures import index_image, rgba_image
+from gsplat_tools.ops.visibility import MOST, VisibleCosts
 
 Float32 = NDArray[np.float32]
 
@@ -66,6 +67,13 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: Previous | None
     low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
     codes = position_codes(cloud.means, low, high)
     quats, log_scales = turned(cloud, shared.rotation_frames)
+    rotations = rotation_bytes(quats, shared)
+    colors = np.empty((len(cloud), 4), np.uint8)
+    colors[:, :3] = nearest_entry(cloud.sh0, shared.sh0_codebook)
+    colors[:, 3] = opacity_bytes(cloud.opacity_logits)
+    costs = None if shared.tolerance is None else shared.tolerance.costs(cloud, log_scales)
+    if costs is not None:
+        codes, rotations, colors = relaxed(cloud, quats, shared, costs, (codes, rotations, colors), (low, high))
     labels: dict[str, Labels] = {}
     labels["scale"] = choose_labels(
         scale_coordinates(log_scales),
@@ -73,15 +81,14 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: Previous | None
         shared.options.keep_tolerance * shared.scale_error,
         None if previous is None else previous.labels["scale"],
         None if previous is None else (cloud.log_scales == previous.cloud.log_scales).all(axis=1),
+        None if costs is None else costs.scale,
+        moves=False,
     )
-    colors = np.empty((len(cloud), 4), np.uint8)
-    colors[:, :3] = nearest_entry(cloud.sh0, shared.sh0_codebook)
-    colors[:, 3] = opacity_bytes(cloud.opacity_logits)
     images = {
         "position_hi": rgba_image((codes >> 8).astype(np.uint8), width, height),
         "position_lo": rgba_image((codes & 0xFF).astype(np.uint8), width, height),
         "scale_indices": index_image(labels["scale"], width, height),
-        "rotation": rgba_image(rotation_bytes(quats, shared), width, height),
+        "rotation": rgba_image(rotations, width, height),
         "sh0": rgba_image(colors, width, height),
     }
     for palette in shared.palettes:
@@ -92,11 +99,33 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: Previous | None
             shared.options.keep_tolerance * palette.error,
             None if previous is None else previous.labels[palette.name],
             None if previous is None else (rows == palette.rows(previous.cloud)).all(axis=1),
+            None if costs is None else costs.harmonics,
         )
         images[f"{palette.name}_labels"] = index_image(labels[palette.name], width, height)
     outside = (cloud.sh0 < shared.sh0_codebook[0]) | (cloud.sh0 > shared.sh0_codebook[-1])
     clipped = {"sh0": int(outside.any(axis=1).sum())} if outside.any() else {}
     return FramePlanes(images, low, high, labels, clipped)
+
+
+def relaxed(
+    cloud: GaussianCloud,
+    quats: Float32,
+    shared: Shared,
+    costs: VisibleCosts,
+    plain: tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]],
+    ends: tuple[Float32, Float32],
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return codes of positions, rotations and colors that compress better, or the plain ones where they do not."""
+    from gsplat_tools.formats.sog4d import relaxing
+
+    layout = (shared.width, shared.height)
+    codes, rotations, colors = plain
+    positions = relaxing.positions(cloud.means, *ends, codes, costs)
+    codes = relaxing.smaller(positions, codes, layout)
+    if shared.options.rotation != "reference":
+        rotations = relaxing.smaller(relaxing.rotations(quats, shared.is_long, rotations, costs), rotations, layout)
+    colors = relaxing.smaller(relaxing.colors(cloud, shared.sh0_codebook, colors, costs), colors, layout)
+    return codes, rotations, colors
 
 
 def position_codes(means: Float32, low: Float32, high: Float32) -> NDArray[np.uint16]:
@@ -147,12 +176,23 @@ def choose_labels(
     tolerance: float,
     previous: Labels | None,
     is_unchanged: NDArray[np.bool_] | None = None,
+    costs: NDArray[np.float64] | None = None,
+    *,
+    moves: bool = True,
 ) -> Labels:
-    """Return the nearest entry of every splat, or the one it had where that adds at most `tolerance` to the square error."""
+    """Return the nearest entry of every splat, or the one it had where that adds at most `tolerance` to the square error.
+
+    With costs, the one it had also where the difference hardly shows, and where it had none a frequent entry (if `moves`).
+    """
     from gsplat_tools.codecs.palette import nearest_labels
 
     if previous is None:
-        return nearest_labels(points, centroids)[0].astype(np.uint16)
+        nearest = nearest_labels(points, centroids)[0]
+        if costs is not None and moves:
+            from gsplat_tools.codecs.relaxation import relax_labels
+
+            nearest = relax_labels(points, costs, centroids, nearest, most=MOST)
+        return nearest.astype(np.uint16)
     chosen = previous.copy()
     rows = np.arange(len(points)) if is_unchanged is None else np.flatnonzero(~is_unchanged)
     if len(rows) == 0:
@@ -160,6 +200,9 @@ def choose_labels(
     moved = points[rows]
     labels, distances = nearest_labels(moved, centroids)
     offsets = moved - centroids[previous[rows]]
-    keeps = np.einsum("nd,nd->n", offsets, offsets) <= distances + np.float32(tolerance)
+    allowed = np.full(len(rows), tolerance, np.float32)
+    if costs is not None:
+        allowed = np.maximum(allowed, (MOST / costs[rows]).astype(np.float32))
+    keeps = np.einsum("nd,nd->n", offsets, offsets) <= distances + allowed
     chosen[rows] = np.where(keeps, previous[rows], labels)
     return chosen

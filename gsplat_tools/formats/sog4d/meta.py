@@ -12,6 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.ops.visibility import Tolerance
+
 Float32 = NDArray[np.float32]
 
 FRAME_TOKEN = "{frame}"
@@ -71,6 +73,7 @@ class Meta:
     sh0_codebook: Float32
     palettes: tuple[PaletteMeta, ...] = ()
     generator: str | None = None
+    tolerance: Tolerance | None = None
 
     def stream_paths(self) -> dict[str, str]:
         """Return the path template of every stream that has an image in every frame, by stream name."""
@@ -119,6 +122,13 @@ def meta_text(meta: Meta) -> bytes:
         "layout": {"type": "row-major", "width": meta.width, "height": meta.height},
         "streams": streams,
     }
+    if meta.tolerance is not None:  # a field of ours, which readers ignore
+        view = meta.tolerance.view
+        root["visualTolerance"] = {
+            "pixels": meta.tolerance.pixels,
+            "center": dict(zip(AXES, view.center, strict=True)),
+            "radius": view.radius,
+        }
     return _text(root).encode()
 
 

@@ -10,6 +10,7 @@ from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._webp import DEFAULT_EFFORT, MAX_SIDE
 from gsplat_tools.formats.knobs import SIZES, Knob, general_knobs
 from gsplat_tools.formats.sog4d.rules import MAX_CODEBOOK, MAX_PALETTE
+from gsplat_tools.ops.visibility import MAX_PIXELS
 
 LabelEncoding = Literal["auto", "full", "delta-v1"]
 RotationMode = Literal["best", "small", "reference"]
@@ -75,6 +76,10 @@ class Sog4dOptions:
     keep_tolerance
         In sequences a splat keeps its scale and SH labels of the frame before as long as that adds no more than this
         share of the palette's own mean squared error.
+    visual_tolerance
+        Pixels, 0 for none: codes move to neighbors that compress better where that shows no more than a bit's worth, the
+        shift of an opaque round splat by so many pixels in a picture in which the scene spans 1,000. The size of the scale
+        codebook, where it is not given, follows from it.
     time_mapping
         "uniform", "explicit", or "auto": as the source has it.
     frame_times
@@ -100,6 +105,7 @@ class Sog4dOptions:
     rotation_steps: int = 64
     palette_rounds: int = 5
     keep_tolerance: float = 0.05
+    visual_tolerance: float = 0.0
     time_mapping: Literal["auto", "uniform", "explicit"] = "auto"
     frame_times: Sequence[float] | None = None
     width: int | None = None
@@ -127,6 +133,8 @@ class Sog4dOptions:
             raise CapabilityError(f"detail must be 0.1 to 4, got {self.detail}")
         if not 0 <= self.keep_tolerance <= 1:
             raise CapabilityError(f"keep_tolerance must be 0 to 1, got {self.keep_tolerance}")
+        if not 0 <= self.visual_tolerance <= MAX_PIXELS:
+            raise CapabilityError(f"visual_tolerance must be 0 to {MAX_PIXELS:g} pixels, got {self.visual_tolerance}")
 
 
 KNOBS: dict[str, Knob] = {

@@ -1,0 +1,193 @@
+"""What a change of a splat shows: the energy of its trace in a picture, so that unlike changes have one measure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.constants import SH_C0
+
+Float64 = NDArray[np.float64]
+
+PICTURE_SIZE = 1000.0
+"""Pixels that the bulk of the scene spans in the picture that tolerances are about."""
+
+LOW_PASS = 0.3
+"""px^2 added to the variance of every splat in a picture (the original 3DGS renderer): nothing is smaller."""
+
+MOST = 16.0
+"""No change is allowed that shows more than what the tolerance trades for so many bits."""
+
+MAX_TURN = 0.342
+"""Sine of half the largest angle, 40 degrees, that a rotation is turned by: the axes stay those that are nearest."""
+
+MAX_PIXELS = 10.0
+"""Largest tolerance that is taken."""
+
+# How much a change shows beyond the energy of its own trace, against a shift. Splats lie over each other, and neighbors are
+# changed alike where codes move to common ones: such errors add up instead of averaging out (docs/visual-tolerance.md).
+_COLOR_FACTOR = 16.0
+_SCALE_FACTOR = 4.0
+
+_MAX_SAMPLES = 100_000
+_EDGE_SHARE = 0.04
+_RADIUS_SHARE = 0.95
+_MIN_COST = 1e-12
+_MAX_LOG = 40.0
+
+
+@dataclass(frozen=True, slots=True)
+class Viewpoint:
+    """From where a scene is looked at: as far away as makes its bulk span `PICTURE_SIZE` pixels.
+
+    Parameters
+    ----------
+    center
+        (3,) middle of the bulk, world units without the origin.
+    radius
+        Of the bulk, world units.
+    """
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def pixels_per_unit(self, means: NDArray[np.float32]) -> Float64:
+        """Return how many pixels a world unit spans at each position, (N,): less in proportion outside the bulk."""
+        distances = np.linalg.norm(means.astype(np.float64) - np.asarray(self.center), axis=1)
+        scale: Float64 = PICTURE_SIZE / 2 / np.maximum(distances, self.radius)
+        return scale
+
+
+@dataclass(frozen=True, slots=True)
+class VisibleCosts:
+    """What changes of each splat show, in units of what the tolerance trades for one bit.
+
+    A change d costs cost x d^2; changes that cost more than `MOST` are not made.
+
+    Parameters
+    ----------
+    position
+        (N,) for a shift along any axis, per world unit squared.
+    rotation
+        (N, 3) for a turn about each local axis, per radian squared.
+    scale
+        (N,) for a change of any scale coordinate, per squared natural logarithm.
+    opacity
+        (N,) per squared opacity, 0..1.
+    color
+        (N,) for a change of any channel of sh0, per square.
+    harmonics
+        (N,) for a change of any coefficient of the higher bands, per square.
+    """
+
+    position: Float64
+    rotation: Float64
+    scale: Float64
+    opacity: Float64
+    color: Float64
+    harmonics: Float64
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """What may show, and from where: a bit is traded for a shift of an opaque round splat by so many pixels."""
+
+    pixels: float
+    view: Viewpoint
+
+    def costs(self, cloud: GaussianCloud, log_scales: NDArray[np.float32]) -> VisibleCosts:
+        """Return what changes of each splat show; see `visible_costs`."""
+        return visible_costs(cloud, log_scales, self.pixels, self.view)
+
+
+def viewpoint(cloud: GaussianCloud) -> Viewpoint:
+    """Return from where a scene is looked at.
+
+    Parameters
+    ----------
+    cloud
+        At least one splat, means finite.
+
+    Returns
+    -------
+    Viewpoint
+        Center: the middle of the box that holds all but 4 % of the opacity on each side. Radius: the distance from it
+        within which 95 % of the opacity lies, so that a few far splats change nothing.
+    """
+    from gsplat_tools.attributes.activations import sigmoid
+
+    step = max(1, -(-len(cloud) // _MAX_SAMPLES))
+    means = cloud.means[::step].astype(np.float64)
+    weights = sigmoid(cloud.opacity_logits[::step].astype(np.float64))
+    if not weights.sum() > 0:
+        weights = np.ones(len(means))
+    low, high = (
+        np.array([_weighted_quantile(means[:, axis], weights, share) for axis in range(3)])
+        for share in (_EDGE_SHARE, 1 - _EDGE_SHARE)
+    )
+    center = (low + high) / 2
+    radius = _weighted_quantile(np.linalg.norm(means - center, axis=1), weights, _RADIUS_SHARE)
+    if radius <= 0:  # one splat, or all in one place: its size is what there is to see
+        radius = float(3 * np.exp(np.clip(np.median(cloud.log_scales), -20, 20)))
+    return Viewpoint((float(center[0]), float(center[1]), float(center[2])), radius)
+
+
+def visible_costs(cloud: GaussianCloud, log_scales: NDArray[np.float32], pixels: float, view: Viewpoint) -> VisibleCosts:
+    """Return what changes of each splat show.
+
+    Parameters
+    ----------
+    cloud
+        N splats.
+    log_scales
+        (N, 3) theirs, in the frames in which rotations are stored.
+    pixels
+        The tolerance: a bit is traded for a shift of an opaque round splat by so many pixels.
+    view
+        From where the scene is looked at.
+
+    Notes
+    -----
+    A splat of opacity o whose trace has the half axes a >= b (px, low-pass included) draws o exp(-r^2 / 2). The energy
+    of its change, integrated over the picture, is (pi / 2) o^2 (a / b) d^2 for a shift by d px, pi a b c^2 for a change
+    of opacity by c, (3 / 4) pi a b o^2 e^2 for one half axis longer by the share e, of which two of three show, and
+    (pi / 4) o^2 (a^2 - b^2)^2 / (a b) t^2 for a turn by t in the plane of the picture, of three planes one. Each follows
+    from the moments of exp(-r^2): 1, 1/2 and 3/4. Bands above 0 have 1 / 4 pi as their mean square over directions.
+    """
+    from gsplat_tools.attributes.activations import sigmoid
+
+    scale = view.pixels_per_unit(cloud.means)
+    opacities = sigmoid(cloud.opacity_logits.astype(np.float64))
+    with np.errstate(divide="ignore"):
+        logs = np.clip(log_scales + np.log(scale)[:, None], -_MAX_LOG, _MAX_LOG)
+    variances = np.exp(2 * logs.astype(np.float64)) + LOW_PASS
+    ordered = np.sort(variances, axis=1)
+    area = np.pi * np.sqrt(ordered[:, 2] * ordered[:, 1])
+    bit = np.pi / 2 * pixels**2
+    power = np.square(opacities) / bit
+    shift = np.pi / 2 * np.sqrt(ordered[:, 2] / ordered[:, 1]) * np.square(scale)
+    pairs = ((1, 2), (0, 2), (0, 1))
+    turns = [
+        np.square(variances[:, i] - variances[:, j]) / np.sqrt(variances[:, i] * variances[:, j]) * (np.pi / 12)
+        for i, j in pairs
+    ]
+    color = _COLOR_FACTOR * power * area
+    costs = {
+        "position": power * shift,
+        "rotation": power[:, None] * np.stack(turns, axis=1),
+        "scale": _SCALE_FACTOR * power * area * (3 / 8),
+        "opacity": area / bit,
+        "color": color * SH_C0**2,
+        "harmonics": color / (4 * np.pi),
+    }
+    return VisibleCosts(**{name: np.maximum(values, _MIN_COST) for name, values in costs.items()})
+
+
+def _weighted_quantile(values: Float64, weights: Float64, share: float) -> float:
+    """Return the smallest value below or at which `share` of the weight lies."""
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(cumulative, share * cumulative[-1])]])
