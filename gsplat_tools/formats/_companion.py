@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsplat_tools.errors import CorruptDataError, FormatError
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._stream import stream_size
 
 SUFFIX = ".json"
@@ -64,8 +65,8 @@ def read_beside(path: Path, stream: BinaryIO) -> dict[str, Any] | None:
     if place.stat().st_size > _MAX_BYTES:
         raise CorruptDataError(f"{place.name} is larger than {_MAX_BYTES} bytes, which no companion is", field=place.name)
     try:
-        whole = json.loads(place.read_bytes())
-    except (ValueError, RecursionError) as error:
+        whole = _json.parse(place.read_bytes())
+    except ValueError as error:
         raise CorruptDataError(f"{place.name} is not JSON: {error}", field=place.name) from error
     if not isinstance(whole, dict):
         raise CorruptDataError(f"{place.name} must hold a JSON object", field=place.name)

@@ -170,8 +170,7 @@ def check_directory(entries: list[zipfile.ZipInfo], directory_offset: int, repea
                 field=name,
                 value=info.compress_type,
             )
-        limit = max_memory()
-        if info.file_size > (info.compress_size * MAX_EXPANSION + _SLACK_BYTES if limit is None else limit):
+        if info.file_size > max(info.compress_size * MAX_EXPANSION + _SLACK_BYTES, max_memory() or 0):
             yield Issue(
                 code="zip-ratio",
                 message=f"the entry claims {info.file_size} bytes from {info.compress_size}, more than is allowed; "

@@ -37,11 +37,23 @@ def _written(record: Format) -> Iterator[Seed]:
     for name, options in (("degree 1", {"sh_degree": 1}), ("moving", {"sh_degree": 0, "motion": True})):
         if name == "moving" and not record.holds_motion:
             continue
-        data = written(record, **options)
+        data, beside = written_files(record, **options)
         text_end = _text_end(data)
         spans = _SPANS.get(record.id, lambda data: (Span(0, min(len(data), 64)),))(data)
         if text_end:
             spans = (Span(0, text_end, "text"),)
+        for companion, text in beside.items():
+            whole = (Span(0, len(text), "text"),)
+            files = {f"scene{record.extensions[0]}": data}
+            yield Seed(
+                f"companion, {name}",
+                companion,
+                text,
+                whole,
+                rebuild=(rebuilders.text(text),),
+                beside=files,
+                target=next(iter(files)),
+            )
         rebuild = (archives.zip_rebuilder(data),) if data[:2] == b"PK" else ()
         yield Seed(
             f"written, {name}", f"scene{record.extensions[0]}", data, spans, _SEALS.get(record.id, _default_seal(data)), rebuild
@@ -50,11 +62,22 @@ def _written(record: Format) -> Iterator[Seed]:
 
 def written(record: Format, **options: Any) -> bytes:
     """Return the file of five random splats."""
+    return written_files(record, **options)[0]
+
+
+def written_files(record: Format, **options: Any) -> tuple[bytes, dict[str, bytes]]:
+    """Return the file of five random splats, and what lies beside it, without the checksum that ties the two together."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", GsplatWarning)
         path = Path(folder) / f"scene{record.extensions[0]}"
         save(random_cloud(5, **options), path, to=record.id, order="none")
-        return path.read_bytes()
+        beside = {}
+        for other in Path(folder).iterdir():
+            if other != path:
+                companion = json.loads(other.read_bytes())
+                companion.pop("file", None)
+                beside[other.name] = json.dumps(companion).encode()
+        return path.read_bytes(), beside
 
 
 def _default_seal(data: bytes) -> Callable[[bytes], bytes]:

@@ -19,7 +19,7 @@ from gsplat_tools.cli._output import finite
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, UnknownFormatError
 from gsplat_tools.formats import load
 from gsplat_tools.formats.base import FileInfo, Format
-from gsplat_tools.formats.loading import located, open_scene
+from gsplat_tools.formats.loading import located, open_as, open_scene
 from gsplat_tools.inspection import describe
 from gsplat_tools.sequence import GaussianSequence
 from gsplat_tools.validation import rules_of, validate
@@ -166,7 +166,7 @@ def _status(key: bytes) -> int:
 
 
 def _inspect(record: Format, path: Path) -> FileInfo:
-    with located(path), path.open("rb") as stream:
+    with located(path), open_as(path, record) as stream:
         info = record.inspect(stream)
     json.dumps(finite(describe(path, record, info)), allow_nan=False)
     return info
@@ -185,7 +185,7 @@ def _read(record: Format, path: Path, *, in_chunks: bool) -> None:
 def _check(record: Format, path: Path) -> None:
     assert record.check is not None
     rules = rules_of(record)
-    with path.open("rb") as stream, located(path):
+    with located(path), open_as(path, record) as stream:
         for issue in record.check(stream):
             assert issue.code in rules, f"the code {issue.code!r} is none of the format's"
 

@@ -33,6 +33,7 @@ class Seed:
     seal        makes checksums right again, or compresses, so that a change reaches the code behind them
     rebuild     each assembles a hostile relative of the file, field by field
     beside      files that lie in the same folder
+    target      the file that is read, where it is not this one but refers to it
     """
 
     name: str
@@ -42,3 +43,4 @@ class Seed:
     seal: Callable[[bytes], bytes] = unsealed
     rebuild: tuple[Callable[[Random], bytes], ...] = ()
     beside: Mapping[str, bytes] = field(default_factory=dict)
+    target: str | None = None

@@ -19,7 +19,7 @@ class Workplace:
         """Write a case and return its path."""
         path = self._folder(case.seed) / case.seed.filename
         path.write_bytes(case.data)
-        return path
+        return path if case.seed.target is None else path.with_name(case.seed.target)
 
     def _folder(self, seed: Seed) -> Path:
         key = f"{seed.filename} {seed.name}"

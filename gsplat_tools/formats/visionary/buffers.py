@@ -20,6 +20,7 @@ from gsplat_tools.codecs.visionary_buffers import Precision, ShLayout
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning, TruncatedDataError
 from gsplat_tools.formats._companion import attach, companion_of
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import Bounds, FileInfo, Scene
 from gsplat_tools.formats.visionary.sidecar import ModelOptions, Sidecar, compose, parse
@@ -83,6 +84,7 @@ def _layout(stream: BinaryIO, precision: Precision) -> tuple[Sidecar, int]:
     count = size // stride if sidecar.splats is None else sidecar.splats
     if size != count * stride or size == 0:
         raise TruncatedDataError(f"expected {stride} bytes a splat, at least one of them, found {size} bytes", offset=size)
+    check_splats(count, sidecar.sh_degree, None, field="splats")
     return sidecar, count
 
 

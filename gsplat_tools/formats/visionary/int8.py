@@ -30,6 +30,7 @@ from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud, empty_cloud
 from gsplat_tools.codecs import visionary_int8 as codec
 from gsplat_tools.errors import CapabilityError, CorruptDataError, LossyConversionWarning, UnsupportedVersionError
 from gsplat_tools.formats._companion import attach
+from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import Bounds, FileInfo, Scene
 from gsplat_tools.formats.visionary.buffers import check
@@ -142,6 +143,7 @@ def _read_header(stream: BinaryIO) -> Header:
     size = stream_size(stream)
     if size != header.size:
         raise CorruptDataError(f"the header promises {header.size} bytes, found {size}", offset=12, field="splats")
+    check_splats(count, degree, None, offset=12, field="splats")
     return header
 
 

@@ -194,7 +194,7 @@ def _matrix(values: Any) -> NDArray[np.float64]:
     """Return the model matrix."""
     try:
         matrix = np.array(values, np.float64).reshape(4, 4).T
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CorruptDataError("expected 16 numbers, column by column", field="modelParams.model") from error
     if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
         raise CorruptDataError("expected finite numbers with the last row 0 0 0 1", field="modelParams.model")
