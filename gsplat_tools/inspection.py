@@ -123,16 +123,18 @@ def describe_values(values: NDArray[Any]) -> dict[str, Any]:
     if finite.size == 0:
         empty = dict.fromkeys(("min", "max", "mean", "std"))
         return {**empty, "percentiles": {}, "nan": num_nan, "inf": num_inf, "histogram": {"edges": [], "counts": []}}
-    try:
-        counts, edges = np.histogram(finite, bins=HISTOGRAM_BINS)
-    except ValueError:  # bins narrower than float64 can part, or wider than it holds
-        counts, edges = np.array([finite.size]), np.array([finite.min(), finite.max()])
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean, std, percentiles = float(finite.mean()), float(finite.std()), np.percentile(finite, PERCENTILES)
+        try:
+            counts, edges = np.histogram(finite, bins=HISTOGRAM_BINS)
+        except ValueError:  # bins narrower than float64 can part, or wider than it holds
+            counts, edges = np.array([finite.size]), np.array([finite.min(), finite.max()])
     return {
         "min": float(finite.min()),
         "max": float(finite.max()),
-        "mean": float(finite.mean()),
-        "std": float(finite.std()),
-        "percentiles": {f"{p:g}": float(v) for p, v in zip(PERCENTILES, np.percentile(finite, PERCENTILES), strict=True)},
+        "mean": mean,
+        "std": std,
+        "percentiles": {f"{p:g}": float(v) for p, v in zip(PERCENTILES, percentiles, strict=True)},
         "nan": num_nan,
         "inf": num_inf,
         "histogram": {"edges": edges.tolist(), "counts": counts.tolist()},

@@ -11,6 +11,9 @@ from gsplat_tools.attributes import activations, quaternions
 
 Floating = TypeVar("Floating", np.float32, np.float64)
 
+_LARGEST_LOG = 350.0
+"""Half of the largest logarithm in float64, with room for sums."""
+
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 _FULL = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
 
@@ -35,12 +38,18 @@ def covariance_matrices(
     Returns
     -------
     NDArray
-        (N, 3, 3) world units squared, exactly symmetric. float32 overflows to inf from a log scale of 44.36.
+        (N, 3, 3) world units squared, exactly symmetric. float32 overflows to inf from a log scale of 44.36; entries that
+        are nothing beside those are 0 where float64 overflows too.
     """
-    halves = quaternions.to_matrix(quats.astype(np.float64)) * activations.exp_scales(log_scales.astype(np.float64))[:, None, :]
+    logs = log_scales.astype(np.float64)
+    longest = logs.max(axis=1, keepdims=True, initial=-np.inf)
+    # Beyond, squares overflow: they are taken relative to the longest axis, so that no infinities meet.
+    unit = np.where((longest > _LARGEST_LOG) & np.isfinite(longest), longest, 0.0)
+    halves = quaternions.to_matrix(quats.astype(np.float64)) * activations.exp_scales(logs - unit)[:, None, :]
     # One product an entry pair, so that both halves of the matrix have the same bits.
     upper = (halves[:, _UPPER[0], :] * halves[:, _UPPER[1], :]).sum(axis=2)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
+        upper = np.where(upper == 0, 0.0, upper * np.exp(2 * unit))
         return to_matrices(upper.astype(dtype))
 
 
