@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Collection, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.constants import VISIBLE_OPACITY
-from gsplat_tools.errors import CapabilityError, FormatError, counts_in_words
+from gsplat_tools.errors import (
+    CapabilityError,
+    FormatError,
+    GsplatWarning,
+    LimitExceededError,
+    TruncatedDataError,
+    UnsupportedVersionError,
+    counts_in_words,
+)
 from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats._issues import Issue, Rule
 from gsplat_tools.formats.base import Format
@@ -18,11 +28,18 @@ from gsplat_tools.formats.loading import located, open_source, read_options
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
 
+T = TypeVar("T")
+
 FIRST_OFFENDERS = 5
 """Offenders of each code that a report names."""
 
 GENERAL_RULES = {
-    "unreadable": Rule(severity="error", meaning="the file cannot be read to its end"),
+    "truncated": Rule(severity="error", meaning="fewer bytes than the header promises", error=TruncatedDataError),
+    "corrupt": Rule(severity="error", meaning="bytes contradict themselves, or do not decompress"),
+    "unsupported-version": Rule(severity="error", meaning="a version that is not read", error=UnsupportedVersionError),
+    "limit-exceeded": Rule(severity="error", meaning="more is claimed than the file can hold", error=LimitExceededError),
+    "unreadable": Rule(severity="error", meaning="the file cannot be read to its end", error=FormatError),
+    "reader-warning": Rule(severity="warning", meaning="the reader warns, and reads on"),
     "invalid-splats": Rule(severity="warning", meaning="values that are not numbers, or rotations of length zero"),
     "no-splats": Rule(severity="warning", meaning="there is nothing to draw"),
     "invisible": Rule(severity="hint", meaning="splats with an opacity below 1/255, which no 8-bit target shows"),
@@ -101,31 +118,59 @@ def _plain(value: Any) -> Any:
 
 def _issues(stream: BinaryIO, record: Format) -> Iterator[Issue]:
     """Yield what the format's own check finds, and what shows in the decoded splats."""
-    is_sound = True
+    found: dict[str, bool] = {}
     if record.check is not None:
         for issue in record.check(stream):
-            is_sound &= record.rules[issue.code].severity != "error"
+            found[issue.code] = record.rules[issue.code].severity == "error"
             yield issue
-    if not is_sound or record.read is None:
+    if any(found.values()) or record.read is None:
         return
     stream.seek(0)
     try:
-        scene = record.read(stream, read_options(record, {}))
+        read = partial(record.read, stream, read_options(record, {}))
+        scene, issues = _heard(read, record, found)
+        yield from issues
         frames = len(scene) if isinstance(scene, GaussianSequence) else 1
         for frame_id in range(frames):
-            cloud = scene.frame(frame_id) if isinstance(scene, GaussianSequence) else scene
+            if isinstance(scene, GaussianSequence):
+                cloud, issues = _heard(partial(scene.frame, frame_id), record, found)
+                yield from issues
+            else:
+                cloud = scene
             yield from _remarks(cloud, frame_id if frames > 1 else None)
     except FormatError as error:
-        # A reader that goes by rules says which one was broken.
-        code = str(getattr(error, "code", "unreadable"))
         yield Issue(
-            code=code if code in record.rules else "unreadable",
+            code=_code_of(error, record),
             message=error.message,
             field=error.field,
             frame=error.frame,
             offset=error.offset,
             value=error.offset,
         )
+
+
+def _code_of(error: FormatError, record: Format) -> str:
+    """Return the rule that a reader says was broken, or else what kind of error it raised."""
+    code = str(getattr(error, "code", ""))
+    if code in record.rules:
+        return code
+    kinds = {rule.error: code for code, rule in GENERAL_RULES.items() if rule.severity == "error"}
+    return kinds.get(type(error), "unreadable")
+
+
+def _heard(function: Callable[[], T], record: Format, known: Collection[str]) -> tuple[T, list[Issue]]:
+    """Call a reader; return what it gives, and its warnings as issues but for codes that are known already."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", GsplatWarning)
+        result = function()
+    issues = []
+    for warning in caught:
+        if not isinstance(warning.message, GsplatWarning):
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+        elif warning.message.code not in known:
+            code = warning.message.code if warning.message.code in record.rules else "reader-warning"
+            issues.append(Issue(code=code, message=str(warning.message), value=warning.message.code))
+    return result, issues
 
 
 def _remarks(cloud: GaussianCloud, frame: int | None) -> Iterator[Issue]:

@@ -34,7 +34,7 @@ def test_validate__says_why_a_file_cannot_be_read(tmp_path: Path) -> None:
     report = json.loads(result.stdout)
     assert result.exit_code == 1
     assert report["valid"] is False
-    assert report["issues"][0]["code"] == "unreadable"
+    assert report["issues"][0]["code"] == "truncated"
     assert "bytes" in report["issues"][0]["message"]
 
 

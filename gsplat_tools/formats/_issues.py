@@ -5,7 +5,8 @@ Checks yield issues and never raise; a reader raises the first error, a validato
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -70,6 +71,26 @@ def refuse(issue: Issue, rules: dict[str, Rule]) -> FormatError:
     error = rules[issue.code].error(issue.message, field=issue.field, frame=issue.frame, offset=issue.offset)
     error.code = issue.code  # type: ignore[attr-defined]
     return error
+
+
+@contextmanager
+def naming_rules(codes: Mapping[str, str]) -> Iterator[None]:
+    """Give refusals inside the block, or the decorated function, the code of the rule that their field is about.
+
+    Parameters
+    ----------
+    codes
+        Code by field, or by the first word of it; the empty string stands for refusals without a field. What is not named
+        is known by the class of the error.
+    """
+    try:
+        yield
+    except FormatError as error:
+        field = error.field or ""
+        code = codes.get(field) or codes.get(field.split(" ")[0])
+        if code is not None and not hasattr(error, "code"):
+            error.code = code  # type: ignore[attr-defined]
+        raise
 
 
 def raise_errors(issues: Iterable[Issue], rules: dict[str, Rule]) -> list[Issue]:

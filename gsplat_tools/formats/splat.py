@@ -26,6 +26,7 @@ from gsplat_tools.cloud import GaussianCloud, empty_cloud
 from gsplat_tools.codecs.smallest_three import Rotation
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning, TruncatedDataError
+from gsplat_tools.formats._issues import Rule, naming_rules
 from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, Scene
@@ -62,6 +63,14 @@ def matches(_head: bytes) -> bool:
     return False
 
 
+RULES = {
+    "record-length": Rule(
+        severity="error", meaning="The file is one or more whole records of 32 bytes.", error=TruncatedDataError
+    )
+}
+
+
+@naming_rules({"": "record-length"})
 def _count(stream: BinaryIO) -> int:
     """Return the splats of a file.
 
@@ -258,6 +267,7 @@ FORMAT = Format(
     read_chunks=read_chunks,
     write=write,
     bounds=bounds,
+    rules=RULES,
     min_splats=1,
     streams=True,
     write_options=SplatOptions,

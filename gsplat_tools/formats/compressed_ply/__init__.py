@@ -24,7 +24,8 @@ from gsplat_tools.codecs.rotation_bounds import covariance_bound_of_ranges
 from gsplat_tools.codecs.smallest_three import PACKED_PLY
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.formats.base import Bounds, FileInfo, Format
-from gsplat_tools.formats.compressed_ply.reading import BLOCK, open_packed, read, read_chunks
+from gsplat_tools.formats.compressed_ply.reading import BLOCK, check, open_packed, read, read_chunks
+from gsplat_tools.formats.compressed_ply.rules import RULES
 from gsplat_tools.formats.compressed_ply.writing import CompressedPlyOptions, write
 from gsplat_tools.formats.knobs import Knob, general_knobs
 
@@ -119,6 +120,8 @@ FORMAT = Format(
     read_chunks=read_chunks,
     write=write,
     bounds=bounds,
+    check=check,
+    rules=RULES,
     stores_coordinates=True,
     stores_splat_model=True,
     order="morton",

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from gsplat_tools.chunks import CHUNK_SIZE, CloudChunks
 from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud, empty_cloud
-from gsplat_tools.errors import CorruptDataError, LossyConversionWarning, UnsupportedVersionError
+from gsplat_tools.errors import CorruptDataError, FormatError, GsplatWarning, LossyConversionWarning, UnsupportedVersionError
+from gsplat_tools.formats._issues import Issue, naming_rules
 from gsplat_tools.formats._limits import check_splats
 from gsplat_tools.formats._ply_comments import SplatComments, splat_comments
 from gsplat_tools.formats._ply_header import PlyElement, PlyHeader, element_offsets, read_header
 from gsplat_tools.formats._stream import read_exactly
+from gsplat_tools.formats.compressed_ply.rules import CODES
 from gsplat_tools.parallel import blocks, run_blocks
 
 BLOCK = 256
@@ -70,6 +72,7 @@ class PackedPly:
         return others + [f"vertex property {name}" for name in self.vertex.property_names() if name not in WORDS]
 
 
+@naming_rules(CODES)
 def open_packed(stream: BinaryIO) -> PackedPly:
     """Read the header and hold it against the format and the size of the file.
 
@@ -153,6 +156,14 @@ class PackedReader:
         if others:
             warnings.warn(LossyConversionWarning(f"left out: {', '.join(others)}", code="left-out-elements"), stacklevel=4)
 
+    def odd_boxes(self) -> NDArray[np.bool_]:
+        """Return whether each box, (N / 256,), is empty or not finite."""
+        low = self._bounds.reshape(-1, 3, 2, 3)[:, :, 0]
+        high = self._bounds.reshape(-1, 3, 2, 3)[:, :, 1]
+        is_sound = np.isfinite(low) & np.isfinite(high) & (low <= high)
+        return np.asarray(~is_sound.all(axis=(1, 2)))
+
+    @naming_rules(CODES)
     def _rows(self, element: PlyElement, start: int, stop: int) -> NDArray[Any]:
         """Read rows of an element as records."""
         size = element.min_row_bytes
@@ -206,6 +217,20 @@ def _tables() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     harmonics = 8 * ((codes + 0.5) / 256 - 0.5)
     harmonics[[0, 255]] = -4, 4
     return logits.astype(np.float32), harmonics.astype(np.float32)
+
+
+def check(stream: BinaryIO) -> Iterator[Issue]:
+    """Yield what is odd about a file that can be read; the reader says what is wrong with others."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GsplatWarning)
+        try:
+            is_odd = PackedReader(stream).odd_boxes()
+        except FormatError:
+            return
+    count = int(np.count_nonzero(is_odd))
+    if count:
+        message = f"{count} of {len(is_odd)} boxes are not finite or have min > max"
+        yield Issue(code="box", message=message, field="chunk", splat=BLOCK * int(np.argmax(is_odd)), count=count)
 
 
 def read(stream: BinaryIO, _options: Any = None) -> GaussianCloud:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import REST_COEFFICIENTS
-from gsplat_tools.errors import CorruptDataError
 from gsplat_tools.formats import _json, _webp
+from gsplat_tools.formats._issues import naming_rules
 from gsplat_tools.formats._limits import splat_bytes, too_much
 from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats._zip import ZipReader, is_relative_name
@@ -186,14 +186,17 @@ class Bundle:
         if path not in self.files:
             raise fault("file-missing", "the file that meta.json names is not there", path)
         data = self.files.read(path, at_most=_webp.most_bytes(most_pixels, 1))
-        header = _webp.parse_header(data, field=path)
+        with naming_rules({path: "image-format"}):
+            header = _webp.parse_header(data, field=path)
         if header.width * header.height > most_pixels:
             message = f"expected at most {most_pixels} pixels, found {header.width} x {header.height}: far more than are used"
             raise fault("image-limit", message, path)
         return data, header
 
     def _decode(self, stream: str, data: bytes, header: _webp.WebpHeader) -> _webp.Image:
-        return _webp.decode_rgba(data, header.width, header.height, field=self.path(stream))
+        path = self.path(stream)
+        with naming_rules({path: "image-format"}):
+            return _webp.decode_rgba(data, header.width, header.height, field=path)
 
 
 def open_bundle(stream: BinaryIO) -> tuple[Bundle | None, Folder | None]:
@@ -255,7 +258,7 @@ def folder_of(stream: BinaryIO) -> Folder:
     """
     name = getattr(stream, "name", None)
     if not isinstance(name, str | os.PathLike):
-        raise CorruptDataError("a meta.json needs the images beside it: give its path, or a .sog archive", field=META_NAME)
+        raise fault("file-missing", "a meta.json needs the images beside it: give its path, or a .sog archive", META_NAME)
     return Folder(Path(name).parent)
 
 

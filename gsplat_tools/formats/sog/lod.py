@@ -107,6 +107,8 @@ class LodScene:
         data = self.folder.read(name)
         if data[:2] == b"PK":
             archive = ZipReader(io.BytesIO(data))
+            if META_NAME not in archive:
+                raise fault("meta-missing", "expected a meta.json at the root of the archive", name)
             meta = parse_meta(archive.read(META_NAME, at_most=_json.MAX_BYTES), f"{name} {META_NAME}")
             check_count(meta, len(data))
             return Bundle(archive, meta)

@@ -42,6 +42,7 @@ RULES: dict[str, Rule] = {
     "bands": _error("bands is 0 to 3."),
     "palette-count": _error(f"The SH palette has 1 to {MAX_PALETTE} entries."),
     "palette-size": _error(f"The image of centroids is {PALETTE_COLUMNS} times the coefficients wide and holds all entries."),
+    "image-format": _error("Images are still lossless WebP that decompress."),
     "image-size": _error("Every image has a pixel for every splat."),
     "image-limit": Rule(
         severity="error",

@@ -22,7 +22,8 @@ from typing import Any, BinaryIO
 from gsplat_tools.chunks import CHUNK_SIZE, CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud, empty_cloud
 from gsplat_tools.codecs.smallest_three import Rotation
-from gsplat_tools.errors import CapabilityError, LossyConversionWarning
+from gsplat_tools.errors import CapabilityError, FormatError, GsplatWarning, LossyConversionWarning
+from gsplat_tools.formats._issues import Issue, naming_rules
 from gsplat_tools.formats.base import Bounds, FileInfo, Format, Scene
 from gsplat_tools.formats.knobs import Knob, general_knobs
 from gsplat_tools.formats.spz import attributes, legacy, limits, streams
@@ -39,6 +40,7 @@ from gsplat_tools.formats.spz.header import (
     coordinate_record,
 )
 from gsplat_tools.formats.spz.payload import Payload
+from gsplat_tools.formats.spz.rules import CODES, RULES, remarks
 from gsplat_tools.parallel import blocks
 from gsplat_tools.sequence import GaussianSequence
 
@@ -88,6 +90,7 @@ def _is_legacy(stream: BinaryIO) -> bool:
     return stream.read(len(GZIP_MAGIC)) == GZIP_MAGIC
 
 
+@naming_rules(CODES)
 def inspect(stream: BinaryIO) -> FileInfo:
     """Return what the header and the extensions say.
 
@@ -115,6 +118,7 @@ def inspect(stream: BinaryIO) -> FileInfo:
     )
 
 
+@naming_rules(CODES)
 def _open(stream: BinaryIO, *, in_memory: bool) -> tuple[Header, Payload]:
     """Read everything but decode nothing; warn about extensions that are left out."""
     if _is_legacy(stream):
@@ -128,6 +132,17 @@ def _open(stream: BinaryIO, *, in_memory: bool) -> tuple[Header, Payload]:
             LossyConversionWarning(f"left out extensions: {', '.join(others)}", code="left-out-extensions"), stacklevel=3
         )
     return header, payload
+
+
+def check(stream: BinaryIO) -> Iterator[Issue]:
+    """Yield what is odd about a file that can be read; the reader says what is wrong with others."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GsplatWarning)
+        try:
+            header, payload = _open(stream, in_memory=False)
+        except FormatError:
+            return
+    yield from remarks(header, payload)
 
 
 def read(stream: BinaryIO, _options: Any = None) -> GaussianCloud:
@@ -264,6 +279,8 @@ FORMAT = Format(
     read_chunks=read_chunks,
     write=write,
     bounds=bounds,
+    check=check,
+    rules=RULES,
     min_splats=1,  # the reference reader refuses a file without splats
     stores_coordinates=True,
     stores_splat_model=True,

@@ -107,7 +107,7 @@ def choose_fractional_bits(chunks: CloudChunks, wanted: FractionalBits) -> int:
         useful = round(np.log2(STEPS_PER_SCALE) - logarithm / np.log(2.0))
         bits = max(min(fitting, max(DEFAULT_FRACTIONAL_BITS, useful), FINEST_FRACTIONAL_BITS), 0)
     if bits > fitting:
-        limit = _LARGEST / (1 << bits)
+        limit = (_LARGEST - 0.5) / (1 << bits)
         outside = sum(int(np.count_nonzero((np.abs(chunk.means) > limit).any(axis=1))) for chunk in chunks)
         raise CapabilityError(
             f"{outside} of {len(chunks)} splats lie beyond {limit:.6g}, the end of 24 bits with {bits} behind the point (up to "
