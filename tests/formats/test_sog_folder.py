@@ -1,9 +1,12 @@
 import errno
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 
+from gsplat_tools.cli.convert import main
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, GsplatError, TargetExistsError, ValidationError
 from gsplat_tools.formats import _folder, load, save
@@ -108,6 +111,34 @@ def test_folder__index_of_something_else_is_replaced_alone(tmp_path: Path) -> No
 def test_lod_meta__is_not_written(tmp_path: Path) -> None:
     with pytest.raises(CapabilityError, match="cannot tell the format"):
         save(scene(), tmp_path / "lod-meta.json")
+
+
+def test_archive_beyond_the_limits_of_old_zip__is_written_and_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save(scene(), tmp_path / "a.sog")
+    monkeypatch.setattr("zipfile.ZIP64_LIMIT", 1000)  # as if the bundle were of 4 GiB
+    monkeypatch.setattr("zipfile.ZIP_FILECOUNT_LIMIT", 2)
+    save(scene(), tmp_path / "b.sog")
+
+    assert b"PK\x06\x06" in (tmp_path / "b.sog").read_bytes()
+    assert_equal(load(tmp_path / "b.sog"), load(tmp_path / "a.sog"))
+
+
+def test_level_of_detail__is_an_option_of_the_command(tmp_path: Path) -> None:
+    for level, count in enumerate((60, 20)):
+        save(scene().take(slice(0, count)), tmp_path / str(level) / "meta.json")
+    lods = {str(level): {"file": level, "offset": 0, "count": count} for level, count in enumerate((60, 20))}
+    tree = {"bound": {"min": [-9, -9, -9], "max": [9, 9, 9]}, "lods": lods}
+    lod = {"version": 1, "lodLevels": 2, "filenames": ["0/meta.json", "1/meta.json"], "tree": tree}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(lod))
+
+    def convert(*options: str) -> Result:
+        arguments = [str(tmp_path / "lod-meta.json"), str(tmp_path / "out.ply"), "--overwrite", "--no-validate", "--json"]
+        return CliRunner().invoke(main, [*arguments, *options])
+
+    assert json.loads(convert().stdout)["splats"] == 60
+    assert json.loads(convert("--lod", "1").stdout)["splats"] == 20
+    assert convert("--lod", "2").exit_code == 1
+    assert "expected a level in 0..1" in convert("--lod", "2").stderr
 
 
 def test_named_files__of_a_broken_index_are_refused() -> None:
