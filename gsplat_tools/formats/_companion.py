@@ -15,7 +15,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from gsplat_tools.errors import CorruptDataError, FormatError
+from gsplat_tools.errors import CorruptDataError, FormatError, WriteError
+from gsplat_tools.formats._files import reason
 from gsplat_tools.formats import _json
 from gsplat_tools.formats._stream import stream_size
 
@@ -149,7 +150,10 @@ def _describe(stream: BinaryIO) -> dict[str, int]:
 
 def _write(path: Path, companion: Mapping[str, Any]) -> None:
     """Write a JSON object and wait until it is on the disk."""
-    with path.open("wb") as stream:
-        stream.write((json.dumps(companion, indent=2, allow_nan=False) + "\n").encode())
-        stream.flush()
-        os.fsync(stream.fileno())
+    try:
+        with path.open("wb") as stream:
+            stream.write((json.dumps(companion, indent=2, allow_nan=False) + "\n").encode())
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as error:
+        raise WriteError(f"cannot write: {reason(error)}", path=path) from error
