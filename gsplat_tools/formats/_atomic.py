@@ -94,11 +94,12 @@ def read_back(stream: BinaryIO, path: Path) -> None:
     WriteError
         It does not hold what was written.
     """
-    stream.flush()
-    os.fsync(stream.fileno())
     assert isinstance(stream, io.BufferedRandom)
     assert isinstance(stream.raw, RecordedFile)
-    offset = stream.raw.first_difference()
+    with _explained(path):
+        stream.flush()
+        os.fsync(stream.fileno())
+        offset = stream.raw.first_difference()
     if offset is not None:
         raise WriteError(
             "what was written does not read back the same: the disk, or the connection to it, is failing, or another program "
@@ -133,7 +134,8 @@ def sweep_stale(path: Path) -> None:
     """Remove temporaries of this target whose writers are gone; those of running ones are locked and stay."""
     pattern = re.compile(rf"\.{re.escape(_stem(path))}\.(\d+)\.[0-9a-z_]+{re.escape(_SUFFIX)}")
     with suppress(OSError):
-        for name in os.listdir(path.parent):  # noqa: PTH208 - names are all that is needed
+        # The shortest first: companions of a temporary file can go once the file itself is gone.
+        for name in sorted(os.listdir(path.parent), key=len):  # noqa: PTH208 - names are all that is needed
             owner = file_of(name)
             match = pattern.fullmatch(owner)
             if match and owner != name:

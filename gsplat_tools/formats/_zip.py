@@ -196,6 +196,13 @@ def is_relative_name(name: str) -> bool:
     return bool(name) and not any(c in name for c in ":\\\0") and not {"", ".", ".."} & set(name.split("/"))
 
 
+class _UnfinishedArchive(zipfile.ZipFile):
+    """An archive that is left as it is when writing fails, instead of being ended by the garbage collector."""
+
+    def __del__(self) -> None:
+        pass
+
+
 class ZipWriter:
     """Writes entries one after another with fixed times and modes, so that equal entries give equal bytes.
 
@@ -206,7 +213,7 @@ class ZipWriter:
     """
 
     def __init__(self, stream: BinaryIO) -> None:
-        self._archive = zipfile.ZipFile(stream, "w", allowZip64=True)
+        self._archive = _UnfinishedArchive(stream, "w", allowZip64=True)
 
     def add(self, name: str, data: bytes, compression: Compression) -> None:
         """Append one entry."""

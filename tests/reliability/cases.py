@@ -42,11 +42,11 @@ class Case:
     scene: Callable[[int, int], Scene]
     in_parts: bool = False
 
-    def write(self, path: Path, splats: int = 12, seed: int = 0) -> None:
-        """Save the scene, replacing what is there."""
+    def write(self, path: Path, splats: int = 12, seed: int = 0, *, overwrite: bool = True) -> None:
+        """Save the scene."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", GsplatWarning)
-            save(self.scene(splats, seed), path, to=self.record.id, overwrite=True)
+            save(self.scene(splats, seed), path, to=self.record.id, overwrite=overwrite)
 
     def content(self, path: Path) -> str | None:
         """Return a digest of what stands at a path, or None for nothing; a target in parts has to be readable."""

@@ -6,18 +6,20 @@ Run as `scripts/reliability crash`, or `python -m tests.reliability.crash --help
 from __future__ import annotations
 
 import argparse
+import errno
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from gsplat_tools.errors import GsplatError
 from tests.reliability.cases import Case, cases
 from tests.reliability.faults import (
     Act,
@@ -25,17 +27,26 @@ from tests.reliability.faults import (
     die_after,
     die_before,
     die_halfway,
+    failing,
     in_child,
     killed_at_line,
     leftovers,
+    lines_of,
+    lose,
     operations_of,
+    spoil,
 )
 
 OLD, NEW = 1, 2
 """Seeds of the scene that stands there before, and of the one that is written."""
 
-RANDOM_SPLATS = 20_000
+RANDOM_SPLATS = 5_000
+NEXT_RUN_EVERY = 5
+"""Kills after which the writer is run once more, and must sweep."""
+
 ACTS = {"before": die_before, "halfway": die_halfway, "after": die_after}
+FAULTS: dict[str, Act] = {"ENOSPC": failing(errno.ENOSPC), "EIO": failing(errno.EIO), "lost": lose, "changed": spoil}
+FAULT_WORDS = {"ENOSPC": {"space"}, "EIO": {"Input/output"}, "lost": {"read"}, "changed": {"read"}}
 
 
 class Broken(AssertionError):
@@ -63,8 +74,8 @@ class Target:
     after: str | None
 
     def write(self) -> None:
-        """Write the new scene."""
-        self.case.write(self.path, self.splats, NEW)
+        """Write the new scene, without leave to overwrite where nothing stands."""
+        self.case.write(self.path, self.splats, NEW, overwrite=self.before is not None)
 
     def check(self, what: str) -> str:
         """Return "old", "new" or "absent"; raise where anything else stands there."""
@@ -77,7 +88,7 @@ class Target:
 
     def check_next_run(self, what: str) -> None:
         """Write once more: that must end well and sweep what the killed writer left."""
-        self.write()
+        self.case.write(self.path, self.splats, NEW)
         if self.case.content(self.path) != self.after:
             raise Broken(f"{self.case.id}, {what}: the next run wrote something else")
         if left := leftovers(self.path.parent):
@@ -110,13 +121,16 @@ def targets(case: Case, splats: int, *, exists: bool) -> Iterator[Callable[[], T
         yield fresh
 
 
-def kill_at_operations(case: Case, *, exists: bool) -> Counter[str]:
-    """Kill the writer before, in the middle of and after every operation."""
+def kill_at_operations(
+    case: Case, *, exists: bool, acts: Mapping[str, Act] = ACTS, most_writes: int | None = None
+) -> Counter[str]:
+    """Kill the writer before, in the middle of and after every operation; run it once more after every few kills."""
     outcomes: Counter[str] = Counter()
     with targets(case, 12, exists=exists) as fresh:
         names = operations_of(fresh().write)
-        for number, name in enumerate(names):
-            for moment, act in ACTS.items():
+        for number in chosen(names, most_writes):
+            name = names[number]
+            for moment, act in acts.items():
                 if moment == "halfway" and name != "write":
                     continue
                 target = fresh()
@@ -129,39 +143,84 @@ def kill_at_operations(case: Case, *, exists: bool) -> Counter[str]:
                 if in_child(work) not in {-signal.SIGKILL, 1}:
                     raise Broken(f"{case.id}, {what}: the child was not killed")
                 outcomes[target.check(what)] += 1
-                target.check_next_run(what)
+                if outcomes.total() % NEXT_RUN_EVERY == 0:
+                    target.check_next_run(what)
     return outcomes
 
 
 def kill_at_lines(case: Case, *, exists: bool, step: int = 1) -> Counter[str]:
-    """Kill the writer before every line of what puts files in place."""
+    """Kill the writer before every line of what puts files in place, when it runs first and when it runs last."""
     outcomes: Counter[str] = Counter()
     with targets(case, 12, exists=exists) as fresh:
-        count = killed_at_line(fresh().write, None)[1]
-        for line in range(0, count, step):
+        places = lines_of(fresh().write)
+        first = {place: number for number, place in reversed(list(enumerate(places)))}
+        last = {place: number for number, place in enumerate(places)}
+        for line in sorted({*first.values(), *last.values()})[::step]:
             target = fresh()
-            what = f"killed at line {line} of {count}"
-            if killed_at_line(target.write, line)[0] != -signal.SIGKILL:
+            what = f"killed at {places[line]}, line {line} of {len(places)}"
+            if killed_at_line(target.write, line) != -signal.SIGKILL:
                 raise Broken(f"{case.id}, {what}: the child was not killed")
             outcomes[target.check(what)] += 1
-            target.check_next_run(what)
+            if outcomes.total() % NEXT_RUN_EVERY == 0:
+                target.check_next_run(what)
     return outcomes
 
 
-def kill_at_random(case: Case, *, exists: bool, times: int, seed: int = 0) -> Counter[str]:
+def fail_at_operations(case: Case, *, exists: bool, most_writes: int | None = None) -> Counter[str]:
+    """Let every operation fail, every write fill the disk, and every write lose or change bytes."""
+    outcomes: Counter[str] = Counter()
+    with targets(case, 12, exists=exists) as fresh:
+        names = operations_of(fresh().write)
+        for number in chosen(names, most_writes):
+            for fault, act in FAULTS.items():
+                if fault != "EIO" and names[number] != "write":
+                    continue
+                target = fresh()
+                what = f"{fault} at operation {number} ({names[number]})"
+                error: Exception | None = None
+                try:
+                    with Operations(number, act, keeps_on=fault == "ENOSPC").installed():
+                        target.write()
+                except (GsplatError, OSError) as caught:
+                    error = caught
+                outcome = target.check(what)
+                outcomes[outcome] += 1
+                if error is None:
+                    # Some operations only tidy up; those that bring bytes to the disk must not fail in silence.
+                    if outcome != "new" or (fault in {"EIO", "ENOSPC"} and names[number] in {"write", "fsync"}):
+                        raise Broken(f"{case.id}, {what}: no error was raised, and the target is {outcome}")
+                    continue
+                if not isinstance(error, GsplatError) or error.path is None or not FAULT_WORDS[fault] & set(str(error).split()):
+                    raise Broken(f"{case.id}, {what}: the error does not say what happened: {error!r}")
+                if names[number] == "write" and (outcome == "new" or leftovers(target.path.parent)):
+                    raise Broken(f"{case.id}, {what}: the target is {outcome}, left are {leftovers(target.path.parent)}")
+    return outcomes
+
+
+def chosen(names: list[str], most_writes: int | None) -> list[int]:
+    """Return the numbers of all operations, or of all but writes and some of those, the first and the last among them."""
+    writes = [number for number, name in enumerate(names) if name == "write"]
+    if most_writes is None or len(writes) <= most_writes:
+        return list(range(len(names)))
+    kept = {writes[round(i * (len(writes) - 1) / (most_writes - 1))] for i in range(most_writes)}
+    return [number for number, name in enumerate(names) if name != "write" or number in kept]
+
+
+def kill_at_random(case: Case, *, exists: bool, times: int, splats: int = RANDOM_SPLATS, seed: int = 0) -> Counter[str]:
     """Kill the writer from outside, at moments spread over the time that it takes."""
     outcomes: Counter[str] = Counter()
     rng = np.random.default_rng(seed)
-    with targets(case, RANDOM_SPLATS, exists=exists) as fresh:
+    with targets(case, splats, exists=exists) as fresh:
         spent = []
         for _ in range(3):
             target, start = fresh(), time.perf_counter()
             if in_child(target.write):
                 raise Broken(f"{case.id}: the writer failed by itself")
             spent.append(time.perf_counter() - start)
-        for _ in range(times):
+        # A child that ends before its moment was not killed, and does not count.
+        while outcomes.total() - outcomes["ended before"] < times:
             target = fresh()
-            moment = rng.uniform(0, 1.1 * float(np.median(spent)))
+            moment = rng.uniform(0, float(np.median(spent)))
             status = in_child(target.write, kill_after=moment)
             what = f"killed after {moment:.4f} s"
             outcome = target.check(what)
@@ -179,7 +238,7 @@ def main() -> int:
     parser.add_argument("--only", help="run the writers whose name holds this")
     given = parser.parse_args()
     start = time.perf_counter()
-    print(f"{'writer':<20}{'killed':<14}{'kills':>7}{'old':>7}{'absent':>8}{'new':>7}{'ended before':>14}")
+    print(f"{'writer':<20}{'killed at':<15}{'times':>7}{'old':>8}{'absent':>8}{'new':>8}{'ended before':>14}")
     broken = 0
     totals: Counter[str] = Counter()
     for case in cases():
@@ -188,7 +247,8 @@ def main() -> int:
         for what, kill in (
             ("operations", kill_at_operations),
             ("lines", kill_at_lines),
-            ("at random", lambda case, *, exists: kill_at_random(case, exists=exists, times=-(-given.kills // 2))),
+            ("failed, lossy", fail_at_operations),
+            ("random moments", lambda case, *, exists: kill_at_random(case, exists=exists, times=-(-given.kills // 2))),
         ):
             outcomes: Counter[str] = Counter()
             try:
@@ -197,12 +257,11 @@ def main() -> int:
             except Broken as error:
                 broken += 1
                 print(f"BROKEN: {error}", file=sys.stderr)
+            ended = outcomes.pop("ended before", 0)
             totals += outcomes
-            cells = [outcomes[name] for name in ("old", "absent", "new", "ended before")]
-            print(
-                f"{case.id:<20}{what:<14}{outcomes.total():>7}{cells[0]:>7}{cells[1]:>8}{cells[2]:>7}{cells[3]:>14}", flush=True
-            )
-    print(f"{totals.total()} kills, {broken} broken promises, {time.perf_counter() - start:.0f} s")
+            cells = "".join(f"{outcomes[name]:>8}" for name in ("old", "absent", "new"))
+            print(f"{case.id:<20}{what:<15}{outcomes.total():>7}{cells}{ended:>14}", flush=True)
+    print(f"{totals.total()} faults, {broken} broken promises, {time.perf_counter() - start:.0f} s")
     return 1 if broken else 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -88,8 +89,10 @@ def die_before(_call: Callable[..., Any], _name: str, _args: tuple[Any, ...]) ->
 
 def die_after(call: Callable[..., Any], _name: str, _args: tuple[Any, ...]) -> None:
     """End the process at once, the operation done."""
-    call()
-    os.kill(os.getpid(), signal.SIGKILL)
+    try:
+        call()
+    finally:
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def die_halfway(call: Callable[..., Any], name: str, args: tuple[Any, ...]) -> None:
@@ -99,12 +102,26 @@ def die_halfway(call: Callable[..., Any], name: str, args: tuple[Any, ...]) -> N
     os._exit(1)
 
 
+def lose(_call: Callable[..., Any], _name: str, args: tuple[Any, ...]) -> int:
+    """Say that bytes are written, and move on without writing them."""
+    file, data = args
+    file.seek(len(data), io.SEEK_CUR)
+    return len(data)
+
+
+def spoil(call: Callable[..., Any], _name: str, args: tuple[Any, ...]) -> Any:
+    """Write one bit differently."""
+    changed = bytearray(args[1])
+    changed[len(changed) // 2] ^= 0x10
+    return call(args[0], changed)
+
+
 def failing(number: int, *, halfway: bool = False) -> Act:
     """Return an act that fails with an error number, as the operating system does; a write may first do its half."""
 
     def act(call: Callable[..., Any], name: str, args: tuple[Any, ...]) -> Any:
-        if halfway and name == "write" and len(args[1]) > 1:
-            return call(args[0], args[1][: len(args[1]) // 2])
+        if halfway and name == "write":
+            return call(args[0], args[1][: max(1, len(args[1]) // 2)])
         raise OSError(number, os.strerror(number))
 
     return act
@@ -153,15 +170,25 @@ def in_child(work: Callable[[], object], *, kill_after: float | None = None) -> 
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def killed_at_line(work: Callable[[], object], line: int | None) -> tuple[int, int]:
-    """Do some work in a child that is killed when a line of TRACED is about to run, counted from 0.
+def killed_at_line(work: Callable[[], object], line: int) -> int:
+    """Do some work in a child that is killed when a line of TRACED is about to run, counted from 0; return its exit status."""
 
-    Returns
-    -------
-    tuple of int
-        The exit status as `in_child` gives it, and how many such lines ran; that only without `line`.
-    """
-    reader, writer = os.pipe()
+    def count_down(number: int, _place: str) -> None:
+        if number == line:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    return in_child(lambda: _traced(work, count_down))
+
+
+def lines_of(work: Callable[[], object]) -> list[str]:
+    """Return where every line of TRACED that some work runs stands, in the order in which they run."""
+    places: list[str] = []
+    _traced(work, lambda _number, place: places.append(place))
+    return places
+
+
+def _traced(work: Callable[[], object], at: Callable[[int, str], object]) -> None:
+    """Do some work, calling a function with number and place before every line of TRACED."""
     count = 0
 
     def trace(frame: FrameType, event: str, _arg: object) -> Any:
@@ -169,24 +196,16 @@ def killed_at_line(work: Callable[[], object], line: int | None) -> tuple[int, i
         if event == "call" and not frame.f_code.co_filename.endswith(TRACED):
             return None
         if event == "line":
-            if count == line:
-                os.kill(os.getpid(), signal.SIGKILL)
+            at(count, f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}")
             count += 1
         return trace
 
-    def traced() -> None:
-        sys.settrace(trace)
-        try:
-            work()
-        finally:
-            sys.settrace(None)
-            os.write(writer, str(count).encode())
-
-    status = in_child(traced)
-    os.close(writer)
-    with os.fdopen(reader) as stream:
-        found = stream.read()
-    return status, int(found or 0)
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        work()
+    finally:
+        sys.settrace(before)
 
 
 def leftovers(folder: Path) -> list[str]:
