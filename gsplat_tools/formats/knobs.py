@@ -65,6 +65,8 @@ SIZES = tuple(round(2 ** (step / 2)) for step in range(10, 31))
 def general_knobs(max_sh_degree: int = MAX_SH_DEGREE) -> dict[str, Knob]:
     """Return the knobs of every format: SH bands, and the opacity below which splats are left out."""
     return {
-        "prune_opacity": Knob(values=(0.1, 0.05, 0.03, 0.02, 0.01, INVISIBLE_OPACITY, 0.0), stream="splats"),
+        "prune_opacity": Knob(
+            values=(0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, INVISIBLE_OPACITY, 0.0), stream="splats"
+        ),
         "sh_degree": Knob(values=tuple(range(max_sh_degree + 1)), stream="sh"),
     }

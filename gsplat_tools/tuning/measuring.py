@@ -193,13 +193,13 @@ class Workbench:
             for _ in range(repeats):
                 start = time.perf_counter()
                 with open_scene(path, in_chunks=False, as_format=record.id) as decoded:
-                    frames = [cloud_of(decoded, frame_id) for frame_id in _drawn_frames(decoded)]
+                    frames = [cloud_of(decoded, frame_id) for frame_id in drawn_frames(decoded)]
                     seconds = time.perf_counter() - start
                     if isinstance(decoded, GaussianSequence):  # all frames, from the few that were decoded
                         seconds *= len(decoded) / len(frames)
                 decode.append(seconds)
         prepared = given[0].scene
-        written = [cloud_of(prepared, frame_id) for frame_id in _drawn_frames(prepared)]
+        written = [cloud_of(prepared, frame_id) for frame_id in drawn_frames(prepared)]
         for before, after in zip(written, frames, strict=True):
             tally.add(before, after)
         likeness = (
@@ -268,7 +268,7 @@ class Workbench:
         """Return the frames of the source that are drawn, one for a still scene, in the axes of a candidate."""
         from gsplat_tools.ops.coordinates import convert_coordinates
 
-        frames = [cloud_of(self.scene, frame_id) for frame_id in _drawn_frames(self.scene)]
+        frames = [cloud_of(self.scene, frame_id) for frame_id in drawn_frames(self.scene)]
         if system in (None, "unknown", frames[0].coordinate_system):
             return frames
         # A format that is always in one system takes unknown axes as RUB, as `prepare` does.
@@ -295,7 +295,7 @@ class Workbench:
         return [render(cloud, camera, model=name, variant=variant).image for cloud in frames for camera in cameras]
 
 
-def _drawn_frames(scene: Scene) -> list[int]:
+def drawn_frames(scene: Scene) -> list[int]:
     """Return the frames that are drawn: 0 for a still scene."""
     if not isinstance(scene, GaussianSequence):
         return [0]

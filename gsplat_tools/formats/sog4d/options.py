@@ -142,7 +142,9 @@ KNOBS: dict[str, Knob] = {
     "version": Knob(values=(1, 2), stream="sh", needs={"sh_degree": (2, 3)}),
     "sh_palette_size": Knob(values=SIZES, stream="sh", graded=True, needs={"sh_degree": (1, 2, 3)}),
     "scale_codebook_size": Knob(values=SIZES, stream="scales", graded=True),
-    "sh0_entries": Knob(values=(12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128, 160, 192, 224, 256), stream="colors", graded=True),
+    "sh0_entries": Knob(
+        values=(4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128, 160, 192, 224, 256), stream="colors", graded=True
+    ),
     "rotation": Knob(values=("small", "best"), stream="rotations"),
     "rotation_steps": Knob(
         values=(16, 18, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 112, 127),

@@ -1,0 +1,383 @@
+"""Find the cheapest encoding that holds a PSNR, or the best one within bytes, by what each knob was measured to do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.errors import ValidationError
+from gsplat_tools.formats.base import Format
+from gsplat_tools.formats.knobs import Knob
+from gsplat_tools.formats.saving import DEFAULT_PRESET
+from gsplat_tools.progress import stage
+from gsplat_tools.remembering import remembering
+from gsplat_tools.sequence import GaussianSequence
+from gsplat_tools.tuning.measuring import Model, Workbench
+from gsplat_tools.tuning.model import Choice, RateModel
+from gsplat_tools.tuning.trials import Trial, Trials, level
+
+TARGET_VIEWS, TARGET_SIZE = 8, (640, 360)
+"""Views that a PSNR target is held at where none are asked for: those of `compare`."""
+
+SEARCH_SPLATS = 1 << 17
+"""Larger scenes are searched on a ball of so many splats around their middle, and verified whole."""
+SEARCH_FRAMES = 3
+"""Frames at the start of a sequence that stand for it while searching."""
+
+_ROUNDS = 7
+_STEP = 0.1
+"""What is asked for beyond the budget after a choice came up again, dB or tenths of the logarithm of the bytes."""
+
+_TINY = 1e-12
+_CLOSE = 0.1
+"""dB above the target, or share of the bytes below the budget, from which looking further is not worth its time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Budget:
+    """What an encoding has to hold.
+
+    Parameters
+    ----------
+    min_psnr
+        dB of the worst view against the source, at the fewest bytes.
+    max_bytes
+        Size of the target; without `min_psnr`, at the highest PSNR of the worst view.
+    max_bytes_per_splat
+        The same for each splat of a frame.
+    """
+
+    min_psnr: float | None = None
+    max_bytes: int | None = None
+    max_bytes_per_splat: float | None = None
+
+    def bytes_for(self, splats: int) -> float:
+        """Return the bytes that so many splats, over all frames, may take."""
+        per_splat = np.inf if self.max_bytes_per_splat is None else self.max_bytes_per_splat * splats
+        return float(min(np.inf if self.max_bytes is None else self.max_bytes, per_splat))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """The encoding that was found.
+
+    Parameters
+    ----------
+    options
+        Values of the knobs that were turned.
+    bytes, psnr_min
+        Of the whole scene, measured; infinite for identical pictures.
+    decisions
+        One a stream: "stream", "options", what it bought over the next smaller one ("bytes", "db"), and what the next
+        larger one would ("next_bytes", "next_db"); numbers are predictions, None where there is no such option.
+    next_db_bytes, next_megabyte_db
+        What one more dB, and one more megabyte, are expected to cost and to bring; None where they cannot be had.
+    trials, seconds
+        Encodings of the whole scene, and time of the search.
+    """
+
+    options: Mapping[str, Any]
+    bytes: int
+    psnr_min: float
+    decisions: list[dict[str, Any]] = field(default_factory=list)
+    next_db_bytes: float | None = None
+    next_megabyte_db: float | None = None
+    trials: int = 0
+    seconds: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the names of the command line's JSON."""
+        return {
+            "options": dict(self.options),
+            "bytes": self.bytes,
+            "psnr_min": self.psnr_min if np.isfinite(self.psnr_min) else None,
+            "decisions": self.decisions,
+            "next_db_bytes": self.next_db_bytes,
+            "next_megabyte_db": self.next_megabyte_db,
+            "trials": self.trials,
+            "seconds": round(self.seconds, 3),
+        }
+
+
+def search(
+    scene: GaussianCloud | GaussianSequence,
+    record: Format,
+    budget: Budget,
+    *,
+    preset: str = DEFAULT_PRESET,
+    pinned: Mapping[str, Any] | None = None,
+    views: int = TARGET_VIEWS,
+    size: tuple[int, int] = TARGET_SIZE,
+    model: Model | None = None,
+) -> Found:
+    """Find the options with the fewest bytes that hold a PSNR, or with the highest PSNR within bytes.
+
+    Parameters
+    ----------
+    scene
+        Valid splats, or a sequence.
+    record
+        Format to write.
+    budget
+        What to hold.
+    preset, pinned
+        What is given: options of the preset below those that are pinned; pinned ones are not turned.
+    views, size, model
+        Automatic views, their size in px, and the rendering model at which the PSNR holds.
+
+    Returns
+    -------
+    Found
+        Verified on the whole scene with the final views.
+
+    Raises
+    ------
+    ValidationError
+        Nothing holds the budget; the message says how close one gets.
+    CapabilityError
+        The format cannot hold the scene.
+
+    Notes
+    -----
+    Every option of a stream is tried by itself, with the pictures of a scene that is the source's but for that stream;
+    the streams' errors and bytes add up to a prediction for all combinations, from which the best is taken, encoded
+    whole, drawn, and the prediction corrected, view by view, by what came out, until it holds. Pictures are half as wide
+    and high while searching.
+    """
+    return Searcher(scene, record, preset=preset, pinned=pinned, views=views, size=size, model=model).find(budget)
+
+
+class Searcher:
+    """One scene and one format, searched for one budget after the other; what was measured serves them all.
+
+    Parameters are those of `search`. `keep_splats` says that no splat may be left out for being faint.
+    """
+
+    def __init__(
+        self,
+        scene: GaussianCloud | GaussianSequence,
+        record: Format,
+        *,
+        preset: str = DEFAULT_PRESET,
+        pinned: Mapping[str, Any] | None = None,
+        views: int = TARGET_VIEWS,
+        size: tuple[int, int] = TARGET_SIZE,
+        model: Model | None = None,
+        keep_splats: bool = False,
+    ) -> None:
+        self._scene, self._keeps_splats = scene, keep_splats
+        pinned = dict(pinned or {})
+        self.whole = Trials(Workbench(scene, views=views, size=size, model=model), record, preset, pinned)
+        half = max(size[0] // 2, 1), max(size[1] // 2, 1)
+        self._part = Trials(Workbench(_part(scene), views=views, size=half, model=model), record, preset, pinned)
+        self._rates: dict[bool, RateModel] = {}
+
+    def find(self, budget: Budget) -> Found:
+        """Return the best encoding within a budget; as `search`, with the same errors."""
+        start = time.perf_counter()
+        keeps_splats = self._keeps_splats or budget.max_bytes_per_splat is not None
+        with remembering(), stage("searching", 0, "trials") as progress:
+            if keeps_splats not in self._rates:
+                knobs = turnable(self._scene, self.whole.record, self.whole.fixed, keep_splats=keeps_splats)
+                self._rates[keeps_splats] = RateModel(self._part, knobs)
+            hunt = _Hunt(self.whole, self._rates[keeps_splats], budget, _count(self._scene))
+            found = hunt.run(progress.advance)
+            return hunt.report(found, time.perf_counter() - start)
+
+
+def turnable(
+    scene: GaussianCloud | GaussianSequence, record: Format, pinned: Mapping[str, Any], *, keep_splats: bool = False
+) -> dict[str, Knob]:
+    """Return the knobs that say something about a scene, their values as far as they do."""
+    from gsplat_tools.ops.harmonics import effective_sh_degree
+
+    frames = [scene] if isinstance(scene, GaussianCloud) else (scene.frame(frame_id) for frame_id in range(len(scene)))
+    given = dict(pinned)
+    if not isinstance(pinned.get("sh_degree"), int):
+        given.pop("sh_degree", None)
+    degree = min(max(map(effective_sh_degree, frames)), record.max_sh_degree)
+    most = max(64, scene.num_splats // 4 if isinstance(scene, GaussianSequence) else len(scene) // 4)
+    if degree == 0:
+        given["sh_degree"] = 0
+    found: dict[str, Knob] = {}
+    for name, knob in record.knobs.items():
+        if name in given or (knob.sequences_only and not isinstance(scene, GaussianSequence)):
+            continue
+        if keep_splats and knob.stream == "splats":
+            continue
+        if any(each in given and given[each] not in values for each, values in knob.needs.items()):
+            continue
+        values = knob.values
+        if name == "sh_degree":
+            values = tuple(value for value in values if value <= degree)
+        elif name.endswith("_size"):
+            values = tuple(value for value in values if value <= most)
+        found[name] = Knob(values=values, stream=knob.stream, graded=knob.graded, needs=knob.needs)
+    return found
+
+
+class _Hunt:
+    """Choose by prediction, verify on the whole scene, correct the prediction, and again."""
+
+    def __init__(self, whole: Trials, rates: RateModel, budget: Budget, splats: int) -> None:
+        self._whole, self._rates, self._budget = whole, rates, budget
+        self._max_bytes = budget.bytes_for(splats)
+        self._ratio, self._scale = 1.0, np.ones(1)
+        self._verified: dict[tuple[int, ...], tuple[Choice, Trial]] = {}
+
+    def run(self, advance: Callable[[int], None]) -> tuple[Choice, Trial]:
+        """Return the best choice that holds."""
+        best: tuple[Choice, Trial] | None = None
+        margin = 0.0
+        for _ in range(_ROUNDS):
+            choice = self._propose(margin)
+            if choice is None:
+                if best is None:
+                    return self._extreme()
+                break
+            if choice.places in self._verified:
+                if best is not None and choice.places == best[0].places and margin == 0:
+                    break
+                margin += _STEP
+                continue
+            trial = self._verify(choice)
+            advance(1)
+            if self._holds(trial) and (best is None or self._is_better(trial, best[1])):
+                best = choice, trial
+                if self._is_close(trial):
+                    break
+        return best or self._extreme()
+
+    def _propose(self, margin: float) -> Choice | None:
+        """Return the best choice by the corrected prediction, a little better than the budget asks for."""
+        wanted = self._budget.min_psnr
+        return self._rates.settle(
+            min_level=None if wanted is None else wanted + margin,
+            max_bytes=self._max_bytes / self._ratio * (1 if wanted is not None else float(np.exp(-margin / 10))),
+            scale=self._scale,
+        )
+
+    def _verify(self, choice: Choice) -> Trial:
+        """Encode and draw the whole scene, and learn from it."""
+        trial = self._whole.encode(self._rates.options_of(choice))
+        self._verified[choice.places] = choice, trial
+        self._correct(choice, trial)
+        return trial
+
+    def _correct(self, choice: Choice, trial: Trial) -> None:
+        """Take the bytes and the errors of every picture by what came out for one choice."""
+        self._ratio = trial.bytes / choice.bytes
+        self._scale = np.maximum(trial.errors, _TINY) / np.maximum(choice.errors, _TINY)
+
+    def _holds(self, trial: Trial) -> bool:
+        wanted = self._budget.min_psnr
+        return trial.bytes <= self._max_bytes and (wanted is None or trial.level >= wanted)
+
+    def _is_better(self, trial: Trial, other: Trial) -> bool:
+        if self._budget.min_psnr is not None:
+            return trial.bytes < other.bytes
+        return (trial.level, -trial.bytes) > (other.level, -other.bytes)
+
+    def _is_close(self, trial: Trial) -> bool:
+        if self._budget.min_psnr is not None:
+            return trial.level < self._budget.min_psnr + _CLOSE
+        return trial.bytes > (1 - 0.1 * _CLOSE) * self._max_bytes
+
+    def _extreme(self) -> tuple[Choice, Trial]:
+        """Try the finest, or the smallest, that there is; say how close it gets where it does not do.
+
+        Raises
+        ------
+        ValidationError
+            It does not hold the budget either.
+        """
+        wanted = self._budget.min_psnr
+        finest = self._rates.settle()
+        assert finest is not None
+        if wanted is not None:
+            trial = self._verify(finest)
+            if self._holds(trial):
+                return finest, trial
+            if trial.level < wanted:
+                raise ValidationError(
+                    f"no setting of {self._whole.record.title} reaches {wanted:g} dB: the finest has {trial.level:.2f} dB in "
+                    f"the worst view at {trial.bytes} bytes; the target is left as it was. Ask for less, or take another format"
+                )
+            cheapest = self._cheapest(wanted)
+            raise ValidationError(
+                f"{wanted:g} dB within {int(self._max_bytes)} bytes cannot be had: {wanted:g} dB take {cheapest.bytes} bytes "
+                f"({cheapest.level:.2f} dB); the target is left as it was"
+            )
+        smallest = self._rates.settle(min_level=0.0)
+        assert smallest is not None
+        trial = self._verify(smallest)
+        if self._holds(trial):
+            return smallest, trial
+        raise ValidationError(
+            f"no setting of {self._whole.record.title} fits into {int(self._max_bytes)} bytes: the smallest has {trial.bytes} "
+            f"bytes and {trial.level:.2f} dB in the worst view; the target is left as it was. Leave out splats, or take "
+            "another format"
+        )
+
+    def _cheapest(self, wanted: float) -> Trial:
+        """Return the smallest encoding that was seen to reach a level, having looked for one."""
+        choice = self._rates.settle(min_level=wanted, scale=self._scale)
+        if choice is not None:
+            self._verify(choice)
+        return min((t for _, t in self._verified.values() if t.level >= wanted), key=lambda trial: trial.bytes)
+
+    def report(self, found: tuple[Choice, Trial], seconds: float) -> Found:
+        """Return what was found, with the prices of a little more."""
+        choice, trial = found
+        self._correct(choice, trial)
+        decisions = []
+        for axis, stream in enumerate(self._rates.streams):
+            smaller, larger = self._rates.neighbours(choice, axis)
+            decisions.append({
+                "stream": stream.name,
+                "options": dict(stream.options[choice.places[axis]]),
+                **self._price("bytes", "db", smaller, choice),
+                **self._price("next_bytes", "next_db", choice, larger),
+            })  # fmt: skip
+        dearer = self._rates.choose(min_level=trial.level + 1, scale=self._scale) if np.isfinite(trial.level) else None
+        richer = self._rates.choose(max_bytes=choice.bytes + 1e6 / self._ratio, scale=self._scale)
+        return Found(
+            options=self._rates.options_of(choice),
+            bytes=trial.bytes,
+            psnr_min=trial.level,
+            decisions=decisions,
+            next_db_bytes=self._price("bytes", "db", choice, dearer)["bytes"],
+            next_megabyte_db=self._price("bytes", "db", choice, richer)["db"],
+            trials=len(self._verified),
+            seconds=seconds,
+        )
+
+    def _price(self, bytes_name: str, db_name: str, coarse: Choice | None, fine: Choice | None) -> dict[str, float | None]:
+        """Return bytes and dB between two choices, as corrected; None where there is only one."""
+        if coarse is None or fine is None:
+            return {bytes_name: None, db_name: None}
+        gain = level(fine.errors * self._scale) - level(coarse.errors * self._scale)
+        return {
+            bytes_name: round(self._ratio * (fine.bytes - coarse.bytes)),
+            db_name: round(float(gain), 3) if np.isfinite(gain) else None,
+        }
+
+
+def _part(scene: GaussianCloud | GaussianSequence) -> GaussianCloud | GaussianSequence:
+    """Return what stands for the scene while searching: a ball of a large one, the first frames of a sequence."""
+    from gsplat_tools.ops.sampling import crop
+
+    if isinstance(scene, GaussianCloud):
+        return crop(scene, SEARCH_SPLATS) if len(scene) > 1.5 * SEARCH_SPLATS else scene
+    frames = [scene.frame(frame_id) for frame_id in range(min(SEARCH_FRAMES, len(scene)))]
+    return GaussianSequence(frames.__getitem__, num_splats=scene.num_splats, sh_degree=scene.sh_degree, num_frames=len(frames))
+
+
+def _count(scene: GaussianCloud | GaussianSequence) -> int:
+    """Return the splats of all frames."""
+    return scene.num_splats * len(scene) if isinstance(scene, GaussianSequence) else len(scene)
