@@ -111,10 +111,7 @@ class RateModel:
         for stream in self.streams:
             sizes, errors = stream.predict()
             at = stream.options.index(self.base[stream.name])
-            if stream.name in _FACTORS:
-                sizes = sizes / sizes[at]
-            else:
-                sizes = sizes - sizes[at]
+            sizes = sizes / sizes[at] if stream.name in _FACTORS else sizes - sizes[at]
             if stream.name == "container":
                 errors = np.zeros((len(sizes), len(self._fixed.errors)))
             elif stream.name == "sh":
