@@ -143,6 +143,9 @@ class Format:
     repair
         Stream of a file and stream to write: a file of today's spelling with the same content; None where there is
         nothing to repair.
+    claims
+        Whether a companion (a JSON object beside the file, see `_companion`) is of this format; None for formats
+        without companions. Files that say themselves what they are do not need theirs to be read.
     read_options, write_options
         Frozen dataclasses whose defaults are the balanced choice.
     presets
@@ -167,14 +170,15 @@ class Format:
     min_splats: int = 0
     check: Callable[[BinaryIO], Iterator[Issue]] | None = None
     rules: Mapping[str, Rule] = field(default_factory=dict)
+    folder: FolderLayout | None = None
     repair: Callable[[BinaryIO, BinaryIO], list[str]] | None = None
+    claims: Callable[[Mapping[str, Any]], bool] | None = None
     lossless: bool = False
+    precise: bool = False
     holds_sequences: bool = False
     holds_motion: bool = False
     holds_extra: bool = False
-    folder: FolderLayout | None = None
     fits_sequences: bool = False
-    precise: bool = False
     stores_origin: bool = False
     stores_coordinates: bool = False
     stores_splat_model: bool = False

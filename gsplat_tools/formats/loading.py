@@ -14,10 +14,11 @@ from typing import Any, BinaryIO, TypeVar, cast
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, UnknownFormatError, counts_in_words
+from gsplat_tools.formats._companion import attach, path_of, read_beside
 from gsplat_tools.formats._files import open_source_file
 from gsplat_tools.formats._stream import seekable
 from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format, Scene
-from gsplat_tools.formats.registry import detect, find_format
+from gsplat_tools.formats.registry import FORMATS, detect, find_format
 from gsplat_tools.sequence import GaussianSequence
 
 AnyScene = TypeVar("AnyScene", bound=Scene)
@@ -50,10 +51,41 @@ def open_source(path: Path) -> tuple[BinaryIO, Format]:
                 stream = seekable(pipe)
         head = stream.read(SNIFF_BYTES)
         stream.seek(0)
-        return stream, detect(head, path)
+        return stream, _with_companion(stream, path, detect(head, path), head)
     except BaseException:
         stream.close()
         raise
+
+
+def open_as(path: Path, record: Format) -> BinaryIO:
+    """Open a file of a known format, with what its companion says; the caller closes it."""
+    stream = open_source_file(path)
+    if record.claims is not None:
+        try:
+            companion = read_beside(path, stream)
+        except BaseException:
+            stream.close()
+            raise
+        if companion is not None:
+            attach(stream, companion)
+    return stream
+
+
+def _with_companion(stream: BinaryIO, path: Path, record: Format, head: bytes) -> Format:
+    """Return the format, which for plain buffers the companion beside them names."""
+    if record.claims is None or record.matches(head):
+        return record
+    companion = read_beside(path, stream)
+    if companion is None:
+        raise UnknownFormatError(
+            f"a {path.suffix} file holds plain buffers, and {path_of(path).name}, which says what they are, is missing",
+            path=path,
+        )
+    attach(stream, companion)
+    for candidate in FORMATS.values():
+        if candidate.claims is not None and candidate.claims(companion):
+            return candidate
+    raise UnknownFormatError(f"{path_of(path).name} names no known format: {companion.get('format')!r}", path=path)
 
 
 def read_options(record: Format, options: dict[str, Any]) -> Any:
@@ -173,7 +205,8 @@ def open_scene(
         if as_format is None:
             stream, record = open_source(path)
         else:
-            stream, record = open_source_file(path), find_format(as_format)
+            record = find_format(as_format)
+            stream = open_as(path, record)
         with stream:
             if on_format is not None:
                 on_format(record)

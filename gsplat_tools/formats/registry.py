@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsplat_tools.errors import CapabilityError, UnknownFormatError
-from gsplat_tools.formats import compressed_ply, ply, sog, sog4d, splat, splat4d, spz
+from gsplat_tools.formats import compressed_ply, ply, sog, sog4d, splat, splat4d, spz, visionary
 from gsplat_tools.formats.base import SNIFF_BYTES, Format
 from gsplat_tools.formats.pack import gscc, spark, uncompressed
 
@@ -20,6 +20,7 @@ _MODULES: tuple[Format, ...] = (
     spz.FORMAT,
     splat.FORMAT,
     splat4d.FORMAT,
+    *visionary.FORMATS,
 )
 
 FORMATS: dict[str, Format] = {record.id: record for record in _MODULES}

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsplat_tools.chunks import CloudChunks
-from gsplat_tools.errors import CapabilityError, FormatError, GsplatWarning, WriteError
+from gsplat_tools.errors import CapabilityError, FormatError, GsplatWarning, TargetExistsError, WriteError
 from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.formats._companion import path_of, write_beside
 from gsplat_tools.formats._folder import folder_size, replacing_folder
 from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats.base import Format, Scene
@@ -192,6 +193,8 @@ def save(
     record = find_target(path, to)
     choices, write_options = split_options(record, preset, options)
     assert record.write is not None
+    if record.claims is not None and path_of(path).exists() and not overwrite:
+        raise TargetExistsError("it stands beside the target and would be replaced; use --overwrite", path=path_of(path))
     with located(path), _replacing(path, record, overwrite=overwrite) as stream:
         start = time.perf_counter()
         prepared = prepare(scene, record, choices)
@@ -200,6 +203,7 @@ def save(
         if splats < record.min_splats:
             raise CapabilityError(f"{record.title} holds at least {record.min_splats} splat, and {splats} are left to write")
         record.write(prepared.scene, stream, write_options)
+        write_beside(stream)
         stream.flush()
         size = stream_size(stream)
         check_header(stream, record, prepared.scene)
