@@ -18,7 +18,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import AttributeTally, compare_rendered, paired, sample
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, ValidationError
 from gsplat_tools.formats.base import Format, Scene
-from gsplat_tools.formats.loading import inspect_file, is_single, open_scene
+from gsplat_tools.formats.loading import drop_or_refuse, inspect_file, is_single, open_as, open_scene
 from gsplat_tools.formats.preparing import Prepared
 from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, save
 from gsplat_tools.progress import stage
@@ -162,6 +162,8 @@ def convert(
         with _open(sources, in_chunks, read_options or {}, options) as (opened, source_format):
             scene, retimed = retime(opened, record, motion, time_at, frame, interpolation, options)
             seconds["read"] = time.perf_counter() - start
+            if options.get("clip") == "rendered":
+                options["clip"] = _rendered_clip(scene, options)
             saved = save(
                 scene,
                 target,
@@ -188,6 +190,16 @@ def convert(
         validation=outcome.get("validation"),
         options={**saved.options, **retimed.facts},
     )
+
+
+def _rendered_clip(scene: Scene, options: dict[str, Any]) -> Any:
+    """Return the int8 ranges that render best."""
+    from gsplat_tools.tuning.precision import choose_clip
+
+    if isinstance(scene, GaussianSequence):
+        return "auto"  # refused by the writer
+    cloud = drop_or_refuse(sample(scene), strict=False)
+    return choose_clip(cloud, **{name: value for name, value in options.items() if name == "position_bits"}).clip
 
 
 @contextmanager
@@ -223,7 +235,7 @@ def _validate(
     tally = AttributeTally()
     pairs: list[tuple[str, GaussianCloud, GaussianCloud]] = []
     in_chunks = not isinstance(source, GaussianSequence)
-    with open_scene(path, in_chunks=in_chunks, as_format=target.id) as decoded, path.open("rb") as header:
+    with open_scene(path, in_chunks=in_chunks, as_format=target.id) as decoded, open_as(path, target) as header:
         if isinstance(source, GaussianSequence) != isinstance(decoded, GaussianSequence):
             if isinstance(decoded, GaussianSequence) and not isinstance(source, GaussianSequence):
                 source = still_sequence(source)

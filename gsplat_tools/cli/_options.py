@@ -109,6 +109,24 @@ class FractionalBitsType(click.ParamType[int | str]):
         return int(value)
 
 
+class ClipType(click.ParamType[float | str]):
+    """0 to below 0.5, auto or rendered."""
+
+    name = "SHARE|auto|rendered"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        """Return the share, or the word."""
+        if value in {"auto", "rendered"}:
+            return str(value)
+        try:
+            share = float(value)
+        except ValueError:
+            share = math.nan
+        if not 0 <= share < 0.5:
+            self.fail(f"{value!r} is not a share from 0 to below 0.5, auto or rendered", param, ctx)
+        return share
+
+
 class FramesType(click.ParamType[int | str]):
     """A number of frames, or auto."""
 

@@ -48,6 +48,24 @@ FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("--fractional-bits", "fractional_bits", {
         "type": options.FractionalBitsType(), "help": "Bits of positions behind the point; auto looks at the scene.",
     }),
+    ("--sh-layout", "sh_layout", {
+        "type": click.Choice(["interleaved", "channel-major"]), "help": "SH of .vis: as Visionary reads it, or its other one.",
+    }),
+    ("--raw-color", "raw_color", {"is_flag": True, "default": None, "help": "Store RGB in .vis; needs --sh-degree 0."}),
+    ("--clip", "clip", {
+        "type": options.ClipType(),
+        "help": "Share of values beyond the int8 ranges; auto: least error, rendered: best pictures.",
+    }),
+    ("--position-bits", "position_bits", {
+        "type": click.IntRange(8, 16), "help": "Bits of a coordinate in blocks of 256 splats, 8 or 16.",
+    }),
+    ("--kernel-size", "kernel_size", {"type": options.FiniteType(0), "help": "Low-pass filter in the sidecar, px^2."}),
+    ("--gaussian-scaling", "gaussian_scaling", {"type": options.FiniteType(0), "help": "Factor of scales in the sidecar."}),
+    ("--opacity-scale", "opacity_scale", {"type": options.FiniteType(0), "help": "Factor of opacities in the sidecar."}),
+    ("--cutoff-scale", "cutoff_scale", {"type": options.FiniteType(0.1), "help": "Factor of projected axes in the sidecar."}),
+    ("--base-offset", "base_offset", {
+        "type": click.IntRange(0, 2**32 - 1), "help": "Splats of the models before this one, in the sidecar.",
+    }),
     ("--level", "level", {"type": click.IntRange(1, 22), "help": "Level of zstd or zlib."}),
     ("--seed", "seed", {"type": int, "help": "Seed of everything random."}),
 )  # fmt: skip
