@@ -257,8 +257,25 @@ def _sog4d() -> list[Seed]:
     ]
 
 
+def _small(files: dict[str, bytes]) -> dict[str, bytes]:
+    """Return a SOG scene of version 2 with codebooks of 32 entries, so that more of meta.json is something else."""
+    from tests.formats.sog_files import palette_image, webp
+
+    meta = json.loads(files["meta.json"])
+    for key in ("scales", "sh0", "shN"):
+        if key in meta:
+            meta[key]["codebook"] = meta[key]["codebook"][:32]
+    files = files | {"meta.json": json.dumps(meta).encode()}
+    files |= {name: webp([(i, i + 1, 31 - i, 50 * i) for i in range(5)]) for name in ("s.webp", "c.webp")}
+    return files | ({"p.webp": palette_image({69: [(1, 2, 31)] * 3}, 70, 3)} if "p.webp" in files else {})
+
+
 def _sog() -> list[Seed]:
-    from tests.formats.sog_files import archive, version_1, version_2
+    from tests.formats.sog_files import archive, version_1
+    from tests.formats.sog_files import version_2 as large
+
+    def version_2(bands: int) -> dict[str, bytes]:
+        return _small(large(bands))
 
     seeds = []
     for name, files in (("version 2", version_2(1)), ("version 1", version_1(1)), ("version 2, plain", version_2(0))):

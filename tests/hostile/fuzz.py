@@ -6,12 +6,14 @@ import argparse
 import json
 import sys
 import tempfile
+from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from gsplat_tools.formats.registry import FORMATS
 from tests.hostile.cases import Case, cases, make_mutant, num_systematic
-from tests.hostile.worker import Result, judge_case, run, warm_up
+from tests.hostile.worker import Result, batches, judge_case, run, warm_up
 from tests.hostile.workplace import Workplace
 
 LEAST_MUTANTS = 10_000
@@ -28,22 +30,39 @@ def main() -> int:
     formats = given.format or [record.id for record in FORMATS.values() if record.read is not None]
     if given.case is not None:
         return _again(formats[0], given.case)
-    results = {}
+    results = {format_id: Result() for format_id in formats}
+    for turn in _turns(formats, given.cases):
+        for format_id, part in turn:
+            result = results[format_id]
+            run(format_id, [part], result)
+            print(f"{format_id}: {result.cases} files in {result.seconds:.0f} s, {len(result.flaws)} flaws", flush=True)
+        if given.report:
+            given.report.write_text(
+                json.dumps({name: _figures(name, result) for name, result in results.items()}, indent=2) + "\n"
+            )
+    figures = {name: _figures(name, result) for name, result in results.items()}
+    print(table(figures))
+    for format_id, result in results.items():
+        for kind, flaw in result.flaws.items():
+            print(f"{format_id}: {kind}, {flaw['count']} times, first case {flaw['case']}: {flaw['detail']}")
+    return int(any(result.flaws for result in results.values()))
+
+
+def _turns(formats: list[str], wanted: int) -> Iterator[list[tuple[str, tuple[int, int]]]]:
+    """Yield the next batch of every format, systematic cases and mutants in turn: a run that is ended early is of all kinds."""
+    queues = []
     for format_id in formats:
         systematic = num_systematic(format_id)
-        result = run(format_id, 0, max(given.cases, systematic + min(LEAST_MUTANTS, given.cases)), report=True)
-        results[format_id] = {"systematic": systematic, **_figures(result)}
-        if given.report:
-            given.report.write_text(json.dumps(results, indent=2) + "\n")
-    print(table(results))
-    for format_id, figures in results.items():
-        for kind, flaw in figures["flaws"].items():
-            print(f"{format_id}: {kind}, {flaw['count']} times, first case {flaw['case']}: {flaw['detail']}")
-    return int(any(figures["flaws"] for figures in results.values()))
+        mutants = max(wanted - systematic, min(LEAST_MUTANTS, wanted))
+        both = zip_longest(batches(0, systematic), batches(systematic, systematic + mutants))
+        queues.append([(format_id, part) for pair in both for part in pair if part is not None])
+    for turn in zip_longest(*queues):
+        yield [item for item in turn if item is not None]
 
 
-def _figures(result: Result) -> dict[str, Any]:
+def _figures(format_id: str, result: Result) -> dict[str, Any]:
     return {
+        "systematic": num_systematic(format_id),
         "cases": result.cases,
         "read": result.outcomes["read"],
         "refused": result.outcomes.total() - result.outcomes["read"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import pytest
 
@@ -65,8 +66,11 @@ def test_judge__notices_errors_that_do_not_say_where(monkeypatch: pytest.MonkeyP
 def test_judge__notices_foreign_warnings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import warnings
 
-    def read(_stream: object, _options: object) -> None:
+    from gsplat_tools.formats import splat
+
+    def read(stream: BinaryIO, options: Any) -> Any:
         warnings.warn("overflow encountered", RuntimeWarning, stacklevel=1)
+        return splat.read(stream, options)
 
     assert _judged(monkeypatch, tmp_path, read) == ["warning"]
 

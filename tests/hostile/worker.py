@@ -13,6 +13,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,26 +69,24 @@ def warm_up(format_id: str, place: Workplace) -> list[str]:
     return broken
 
 
-def run(format_id: str, start: int, stop: int, *, report: bool = False) -> Result:
-    """Judge the cases start..stop of a format, in one child process after the other."""
-    result = Result()
+def run(format_id: str, ranges: Iterable[tuple[int, int]], result: Result) -> None:
+    """Judge ranges of cases of a format, each in a child process of its own, and add to the result."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory(dir=_memory_folder()) as folder:
         root = Path(folder)
-        broken = warm_up(format_id, Workplace(root / "warm-up"))
-        for message in broken:
+        for message in warm_up(format_id, Workplace(root / "warm-up")):
             result.add_flaw("seed", "not read", message, -1)
-        position = start
-        while position < stop:
-            position = _run_child(format_id, position, min(position + _BATCH, stop), root, result)
-            if report:
-                rate = (position - start) / max(time.monotonic() - began, 1e-9)
-                print(
-                    f"{format_id}: {position - start} of {stop - start}, {rate:.0f} a second, {len(result.flaws)} flaws",
-                    flush=True,
-                )
-    result.seconds = time.monotonic() - began
-    return result
+        for start, stop in ranges:
+            position = start
+            while position < stop:
+                position = _run_child(format_id, position, stop, root, result)
+    result.seconds += time.monotonic() - began
+
+
+def batches(start: int, stop: int) -> Iterator[tuple[int, int]]:
+    """Yield start..stop in ranges that one child judges."""
+    for first in range(start, stop, _BATCH):
+        yield first, min(first + _BATCH, stop)
 
 
 def _memory_folder() -> str | None:
