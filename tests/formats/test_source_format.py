@@ -49,7 +49,9 @@ def test_lossy_to_exact__does_not_warn_and_records_the_source(tmp_path: Path) ->
     assert save_counting(lossy(tmp_path), tmp_path / "b.gspk", to="uncompressed") == []
 
     assert b"\ncomment source_format spz\n" in (tmp_path / "b.ply").read_bytes()
-    for name in ("b.ply", "b.gspk"):
+    assert save_counting(lossy(tmp_path), tmp_path / "b.vis", to="visionary-f32") == []
+    assert read(tmp_path / "b.vis").source_format == "spz"
+    for name in ("b.ply", "b.gspk", "b.vis"):
         assert len(save_counting(read(tmp_path / name), tmp_path / "c.sog", overwrite=True)) == 1
 
 

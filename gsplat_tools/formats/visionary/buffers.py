@@ -138,7 +138,7 @@ def read_chunks(stream: BinaryIO, precision: Precision) -> CloudChunks:
             gaussians = words_at(0, row, start, stop, "gaussian buffer")
             yield decode(gaussians, words_at(count * row, color_row, start, stop, "color buffer"), sidecar)
 
-    template = empty_cloud(0, sidecar.sh_degree).replace(origin=sidecar.origin)
+    template = empty_cloud(0, sidecar.sh_degree).replace(origin=sidecar.origin, source_format=sidecar.source_format)
     return CloudChunks(count, template, iterate)
 
 
@@ -153,7 +153,7 @@ def decode(gaussians: NDArray[np.uint32], colors: NDArray[np.uint32], sidecar: S
         What they hold.
     """
     precision: Precision = "f32" if sidecar.precision == "f32" else "f16"
-    cloud = empty_cloud(len(gaussians), sidecar.sh_degree).replace(origin=sidecar.origin)
+    cloud = empty_cloud(len(gaussians), sidecar.sh_degree).replace(origin=sidecar.origin, source_format=sidecar.source_format)
 
     def decode_block(start: int, stop: int) -> None:
         part = slice(start, stop)
@@ -223,6 +223,7 @@ def write(scene: Scene, stream: BinaryIO, options: BufferOptions, precision: Pre
         buffers,
         sh_layout=options.sh_layout,
         raw_color=options.raw_color,
+        source_format=chunks.template.source_format,
     )
     attach(stream, sidecar)
 

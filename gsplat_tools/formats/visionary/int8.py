@@ -281,7 +281,9 @@ def write(scene: Scene, stream: BinaryIO, options: Int8Options) -> None:
     stream.writelines(parts)
     start = _HEADER.size + len(parts[0])
     buffers = [("gaussian", start, header.record.itemsize), ("color", start + len(parts[1]), header.channels - 3)]
-    attach(stream, compose("i8", len(cloud), cloud.sh_degree, cloud.origin, options, buffers))
+    attach(
+        stream, compose("i8", len(cloud), cloud.sh_degree, cloud.origin, options, buffers, source_format=cloud.source_format)
+    )
 
 
 def _calibrate(cloud: GaussianCloud, log_scales: NDArray[np.float32], colors: NDArray[np.float32], clip: Clip) -> codec.Ranges:

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_tools.cloud import source_format_of
 from gsplat_tools.codecs.visionary_buffers import MAX_SH_DEGREE, ShLayout
 from gsplat_tools.errors import CapabilityError, CorruptDataError, GsplatWarning
 
@@ -75,6 +76,8 @@ class Sidecar:
         Whether the color buffer holds RGB without SH.
     origin
         World position of the means' zero: the translation of the model matrix.
+    source_format
+        Lossy format that the values went through, or empty.
     params
         ModelParams as they are spelled there.
     """
@@ -85,6 +88,7 @@ class Sidecar:
     sh_layout: ShLayout = "interleaved"
     raw_color: bool = False
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    source_format: str = ""
     params: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -98,6 +102,7 @@ def compose(
     *,
     sh_layout: ShLayout = "interleaved",
     raw_color: bool = False,
+    source_format: str = "",
 ) -> dict[str, Any]:
     """Return the sidecar of a file that is being written.
 
@@ -115,6 +120,8 @@ def compose(
         Name, offset and bytes a splat of every buffer in the file.
     sh_layout, raw_color
         What the color buffer holds.
+    source_format
+        Lossy format that the values went through, or empty.
     """
     matrix = np.eye(4)
     matrix[:3, 3] = origin
@@ -124,6 +131,7 @@ def compose(
         "shDegree": sh_degree,
         "color": "raw" if raw_color else "sh",
         "shLayout": sh_layout,
+        **({"sourceFormat": source_format} if source_format else {}),
         "buffers": [{"name": name, "offset": offset, "stride": stride} for name, offset, stride in buffers],
         "modelParams": {
             "model": matrix.T.ravel().tolist(),  # column-major, as in the uniform
@@ -186,6 +194,7 @@ def parse(companion: Mapping[str, Any], precision: str) -> Sidecar:
         sh_layout=layout,
         raw_color=color == "raw",
         origin=matrix[:3, 3],
+        source_format=source_format_of(companion.get("sourceFormat")),
         params=params,
     )
 
