@@ -27,7 +27,7 @@ LEVEL = 127
 FLAT = -128
 """Code of log scale -inf."""
 
-SAMPLE = 1 << 16
+SAMPLE = 1 << 15
 """Splats at most that ranges are calibrated on, evenly spaced."""
 
 _LOW_SHARES = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.05, 0.1, 0.2, 0.3)
@@ -139,16 +139,19 @@ def calibrated_ranges(values: NDArray[Any], weights: NDArray[Any], sizes: NDArra
     stride = max(1, -(-len(values) // SAMPLE))
     sample, weights = values[::stride].astype(np.float64), np.asarray(weights, np.float64)[::stride]
     logs = None if sizes is None else np.log(np.asarray(sizes, np.float64))[::stride]
-    for channel in range(values.shape[1]):
+
+    def calibrate(channel: int, _stop: int) -> None:
         is_finite = np.isfinite(sample[:, channel])
         column = sample[is_finite, channel]
         if not len(column):
-            continue
+            return
         order = np.argsort(column, kind="stable")
         column, own = column[order], weights[is_finite][order]
         gain = np.ones(len(column)) if logs is None else np.exp(2 * (column - logs[is_finite][order]))
         weightings = [own * gain, np.sqrt(own) * gain, gain]
         low[channel], high[channel] = _best_ends(column, weightings, low[channel], high[channel], is_log=logs is not None)
+
+    run_blocks(calibrate, values.shape[1], 1)
     return make_ranges(low, high)
 
 
