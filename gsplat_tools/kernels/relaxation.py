@@ -20,7 +20,7 @@ def relax_numbers(targets, costs, bits, carry, most, low, high, start, stop, cod
     """
     for i in range(start, stop):
         nearest = min(max(np.int64(np.rint(targets[i])), low), high)
-        reach = np.int64(min(255.0, np.sqrt(most / costs[i])))
+        reach = np.int64(min(255.0, 1.0 + np.sqrt(most / costs[i])))
         best, chosen = np.inf, nearest
         for code in range(max(low, nearest - reach), min(high, nearest + reach) + 1):
             distance = (code - targets[i]) * (code - targets[i]) * costs[i]
@@ -48,24 +48,30 @@ def relax_colors(targets, costs, codebook, bits, reach, most, start, stop, codes
     codes        uint8 (N, 3)     read: the nearest; written
     """
     size = codebook.shape[0]
+    least_bits = np.float64(bits[0].min()) + np.float64(bits[2].min())
     for i in range(start, stop):
         nearest_r, nearest_g, nearest_b = np.int64(codes[i, 0]), np.int64(codes[i, 1]), np.int64(codes[i, 2])
         best = np.inf
         best_r, best_g, best_b = nearest_r, nearest_g, nearest_b
-        for g in range(max(0, nearest_g - reach), min(size - 1, nearest_g + reach) + 1):
-            offset = np.float64(codebook[g]) - np.float64(targets[i, 1])
-            distance = offset * offset * costs[i]
-            if distance > most and g != nearest_g:
-                continue
-            total = distance + bits[1, g]
-            if total >= best:
-                continue
-            least_r, r = _cheapest(targets[i, 0], costs[i], codebook, bits[0], g, nearest_r, reach, most)
-            least_b, b = _cheapest(targets[i, 2], costs[i], codebook, bits[2], g, nearest_b, reach, most)
-            total += least_r + least_b
-            if total < best:
-                best = total
-                best_r, best_g, best_b = r, g, b
+        # Outwards from the nearest, down and up: distances rise, so that each way ends early.
+        for way in (-1, 1):
+            for away in range(0 if way < 0 else 1, reach + 1):
+                g = nearest_g + way * away
+                if g < 0 or g >= size:
+                    break
+                offset = np.float64(codebook[g]) - np.float64(targets[i, 1])
+                distance = offset * offset * costs[i]
+                if away > 0 and (distance > most or distance + least_bits >= best):
+                    break
+                total = distance + bits[1, g]
+                if total + least_bits >= best:
+                    continue
+                least_r, r = _cheapest(targets[i, 0], costs[i], codebook, bits[0], g, nearest_r, reach, most)
+                least_b, b = _cheapest(targets[i, 2], costs[i], codebook, bits[2], g, nearest_b, reach, most)
+                total += least_r + least_b
+                if total < best:
+                    best = total
+                    best_r, best_g, best_b = r, g, b
         codes[i, 0], codes[i, 1], codes[i, 2] = np.uint8(best_r), np.uint8(best_g), np.uint8(best_b)
 
 
@@ -73,14 +79,18 @@ def relax_colors(targets, costs, codebook, bits, reach, most, start, stop, codes
 def _cheapest(target, cost, codebook, bits, green, nearest, reach, most):
     """Return the smallest sum of bits and cost of one channel, and its index."""
     least, chosen = np.inf, nearest
-    for k in range(max(0, nearest - reach), min(codebook.shape[0] - 1, nearest + reach) + 1):
-        offset = np.float64(codebook[k]) - np.float64(target)
-        distance = offset * offset * cost
-        if distance > most and k != nearest:
-            continue
-        total = distance + bits[(k - green) & 255]
-        if total < least:
-            least, chosen = total, k
+    for way in (-1, 1):
+        for away in range(0 if way < 0 else 1, reach + 1):
+            k = nearest + way * away
+            if k < 0 or k >= codebook.shape[0]:
+                break
+            offset = np.float64(codebook[k]) - np.float64(target)
+            distance = offset * offset * cost
+            if away > 0 and (distance > most or distance >= least):
+                break
+            total = distance + bits[(k - green) & 255]
+            if total < least:
+                least, chosen = total, k
     return least, chosen
 
 

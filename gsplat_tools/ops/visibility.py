@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,9 @@ MAX_PIXELS = 10.0
 # changed alike where codes move to common ones: such errors add up instead of averaging out (docs/visual-tolerance.md).
 _COLOR_FACTOR = 16.0
 _SCALE_FACTOR = 4.0
+
+# Of float32 and of float64 differences of large numbers.
+_ROUNDING = 1e-5
 
 _MAX_SAMPLES = 100_000
 _EDGE_SHARE = 0.04
@@ -101,6 +106,23 @@ class Tolerance:
     def costs(self, cloud: GaussianCloud, log_scales: NDArray[np.float32]) -> VisibleCosts:
         """Return what changes of each splat show; see `visible_costs`."""
         return visible_costs(cloud, log_scales, self.pixels, self.view)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a file says about the tolerance that it was written with."""
+        center = dict(zip("xyz", self.view.center, strict=True))
+        return {"pixels": self.pixels, "center": center, "radius": self.view.radius}
+
+
+def tolerance_from_json(value: Any) -> Tolerance | None:
+    """Return what `Tolerance.to_json` gave; anything that no writer of ours gives counts as no tolerance."""
+    try:
+        x, y, z = (float(value["center"][axis]) for axis in "xyz")
+        pixels, radius = float(value["pixels"]), float(value["radius"])
+    except (TypeError, KeyError, ValueError, OverflowError):
+        return None
+    if not (0 < pixels <= MAX_PIXELS and 0 < radius < math.inf and all(map(math.isfinite, (x, y, z)))):
+        return None
+    return Tolerance(pixels, Viewpoint((x, y, z), radius))
 
 
 def viewpoint(cloud: GaussianCloud) -> Viewpoint:
@@ -184,6 +206,11 @@ def visible_costs(cloud: GaussianCloud, log_scales: NDArray[np.float32], pixels:
         "harmonics": color / (4 * np.pi),
     }
     return VisibleCosts(**{name: np.maximum(values, _MIN_COST) for name, values in costs.items()})
+
+
+def allowed_error(costs: Float64) -> Float64:
+    """Return the largest change that is made for the sake of a bit, from its cost per square, with room for rounding."""
+    return np.asarray(np.sqrt(MOST / costs) * (1 + _ROUNDING), np.float64)
 
 
 def _weighted_quantile(values: Float64, weights: Float64, share: float) -> float:

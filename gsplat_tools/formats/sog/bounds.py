@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog.bundle import open_bundle
+from gsplat_tools.ops.visibility import allowed_error
 
 _HALF_STEP, _SMALLEST = 2.0**-24 * (1 + 1e-6), 2.0**-150
 """Rounding to float32: relative, with what float64 arithmetic adds, and half of the smallest subnormal."""
@@ -51,11 +52,24 @@ def bounds(source: GaussianCloud, stream: BinaryIO) -> Bounds:
     covariances = relative_covariance_bound(source.log_scales, _distances(source.log_scales, meta.scales[0]), angle)
     # A splat without any extent gets one, so that no relative error is left.
     has_extent = np.isfinite(source.log_scales).any(axis=1)
+    opacities = np.full(len(source), 0.5 / 255)
+    colors, scales = _distances(source.sh0, meta.sh0[0]), _distances(np.sort(source.log_scales, axis=1), meta.scales[0])
+    if meta.tolerance is not None:
+        costs = meta.tolerance.costs(source, source.log_scales)
+        # d of n moves x by at most (1 + |x|) (exp(d) - 1), and costs are of (1 + |x|) d.
+        logs = np.minimum(allowed_error(costs.position)[:, None] / (1 + sizes), meta.means_high - meta.means_low)
+        moved = np.maximum(moved, (1 + sizes) * np.expm1(logs))
+        opacities = np.maximum(opacities, allowed_error(costs.opacity))
+        colors = np.maximum(colors, allowed_error(costs.color)[:, None])
+        # Sorted values move by no more than the values.
+        stretched = np.maximum(_distances(source.log_scales, meta.scales[0]), allowed_error(costs.scale)[:, None])
+        scales = np.maximum(scales, np.max(stretched, axis=1, keepdims=True))
+        covariances = np.maximum(covariances, relative_covariance_bound(source.log_scales, stretched, angle))
     return {
         "means": moved + (sizes + moved) * _HALF_STEP + _SMALLEST,
-        "opacities": np.full(len(source), 0.5 / 255 + 1e-6),  # the ends are read as 1e-6 and 1 - 1e-6
-        "sh0": _distances(source.sh0, meta.sh0[0]),
-        "scales": _distances(np.sort(source.log_scales, axis=1), meta.scales[0]),
+        "opacities": opacities + 1e-6,  # the ends are read as 1e-6 and 1 - 1e-6
+        "sh0": colors,
+        "scales": scales,
         "covariances": np.where(has_extent, covariances, np.inf),
     }
 

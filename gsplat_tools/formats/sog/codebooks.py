@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.formats.sog.options import SogOptions
 from gsplat_tools.formats.sog.rules import CODEBOOK_SIZE
+from gsplat_tools.ops.visibility import MOST
 
 Float32 = NDArray[np.float32]
 Labels = NDArray[np.int64]
@@ -153,7 +154,13 @@ def _color_error(squares: Float32, weights: Float32) -> float:
     return math.sqrt(mean / 3 / (4 * math.pi))
 
 
-def fit_palette(shn: Float32, weights: Float32, rows: slice | NDArray[np.int64], options: SogOptions) -> Palette:
+def fit_palette(
+    shn: Float32,
+    weights: Float32,
+    rows: slice | NDArray[np.int64],
+    options: SogOptions,
+    costs: NDArray[np.float64] | None = None,
+) -> Palette:
     """Return the SH palette and the entry of every splat that is nearest to what is stored.
 
     Parameters
@@ -166,6 +173,8 @@ def fit_palette(shn: Float32, weights: Float32, rows: slice | NDArray[np.int64],
         Which of them it is fitted on.
     options
         Size and effort.
+    costs
+        (N,) what a squared distance shows; labels then move to frequent entries where that costs little.
     """
     from gsplat_tools.codecs import palette
     from gsplat_tools.codecs.scalar_codebook import fit_codebook, nearest_entry
@@ -178,5 +187,9 @@ def fit_palette(shn: Float32, weights: Float32, rows: slice | NDArray[np.int64],
     codebook = fit_codebook(centroids.ravel(), size=CODEBOOK_SIZE)
     indices = np.unique(nearest_entry(centroids, codebook).astype(np.uint8), axis=0)
     labels, _ = palette.nearest_labels(points, codebook[indices])
+    if costs is not None:
+        from gsplat_tools.codecs.relaxation import relax_labels
+
+        labels = relax_labels(points, costs, codebook[indices], labels, most=MOST)
     used, labels = np.unique(labels, return_inverse=True)
     return Palette(codebook, indices[used].reshape(len(used), -1, 3), labels)

@@ -21,6 +21,7 @@ from gsplat_tools.formats.sog.codebooks import FLAT_STEP, Palette, fit_colors, f
 from gsplat_tools.formats.sog.meta import META_NAME
 from gsplat_tools.formats.sog.options import SogOptions
 from gsplat_tools.formats.sog.rules import PALETTE_COLUMNS
+from gsplat_tools.ops.visibility import Tolerance, viewpoint
 from gsplat_tools.parallel import map_ordered, run_blocks
 from gsplat_tools.progress import stage
 
@@ -76,7 +77,7 @@ def write(cloud: GaussianCloud, stream: BinaryIO, options: SogOptions) -> None:
 
     def compress(name: str) -> bytes:
         # Low position bytes are noise, which more effort hardly shrinks.
-        is_noise = name == "means_l" and 1 <= options.webp_effort <= _webp.DEFAULT_EFFORT
+        is_noise = name == "means_l" and options.visual_tolerance == 0 and 1 <= options.webp_effort <= _webp.DEFAULT_EFFORT
         return _webp.encode_rgba(encoded.images[name], 1 if is_noise else options.webp_effort)
 
     archive = ZipWriter(stream)
@@ -145,11 +146,16 @@ def encode(cloud: GaussianCloud, options: SogOptions) -> Encoded:
         pixels["sh0"][part, 3] = opacity_bytes(cloud.opacity_logits[part])
 
     run_blocks(fill, len(cloud))
+    tolerance = Tolerance(options.visual_tolerance, viewpoint(cloud)) if options.visual_tolerance > 0 else None
+    costs = None if tolerance is None else tolerance.costs(cloud, log_scales)
+    if costs is not None:
+        from gsplat_tools.formats.sog.relaxing import relax
+
+        relax(images, cloud, log_scales, costs, (scales, colors), (low, high), signed_log(cloud.means))
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {
-            "generator": f"{GENERATOR} {__version__}" + (f" from {cloud.source_format}" if cloud.source_format else "")
-        },
+        "asset": {"generator": f"{GENERATOR} {__version__}" + (f" from {cloud.source_format}" if cloud.source_format else "")},
+        **({} if tolerance is None else {"visualTolerance": tolerance.to_json()}),
         "count": len(cloud),
         # The specification says `antialias`, the writers in use say `model`.
         **({"model": cloud.splat_model} if cloud.splat_model != "default" else {}),
@@ -160,7 +166,7 @@ def encode(cloud: GaussianCloud, options: SogOptions) -> Encoded:
         "sh0": {"codebook": shortest(colors), "files": ["sh0.webp"]},
     }
     if cloud.sh_degree:
-        palette = fit_palette(cloud.shN, weights, rows, options)
+        palette = fit_palette(cloud.shN, weights, rows, options, None if costs is None else costs.harmonics)
         images |= palette_images(palette, width, height)
         meta["shN"] = {
             "count": len(palette.indices),

@@ -15,6 +15,7 @@ from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats._zip import is_relative_name
 from gsplat_tools.formats.sog.rules import CODEBOOK_SIZE, MAX_PALETTE, fault
+from gsplat_tools.ops.visibility import Tolerance, tolerance_from_json
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -61,6 +62,8 @@ class Meta:
         As `GaussianCloud` has it.
     generator
         Who wrote the file, or empty.
+    tolerance
+        What it was written with, where a writer of ours says so.
     issues
         What is less than an error.
     """
@@ -78,6 +81,7 @@ class Meta:
     files: dict[str, str]
     splat_model: SplatModel = "default"
     generator: str = ""
+    tolerance: Tolerance | None = None
     issues: list[Issue] = field(default_factory=list)
 
     @property
@@ -158,6 +162,7 @@ def _version_2(root: Fields) -> Meta:
         files=_files({**parts, **({"shN": shn} if shn is not None and has_rest else {})}),
         splat_model=_splat_model(root.value, issues),
         generator=_generator(root.value),
+        tolerance=tolerance_from_json(root.value.get("visualTolerance")),
         issues=issues,
     )
 

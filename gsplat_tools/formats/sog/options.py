@@ -9,6 +9,7 @@ from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._webp import DEFAULT_EFFORT
 from gsplat_tools.formats.knobs import SIZES, Knob, general_knobs
 from gsplat_tools.formats.sog.rules import MAX_PALETTE
+from gsplat_tools.ops.visibility import MAX_PIXELS
 
 RotationMode = Literal["best", "small", "reference"]
 
@@ -44,6 +45,9 @@ class SogOptions:
         Rounds of k-means for the SH palette at most.
     webp_effort
         0 (fastest) to 9 (smallest).
+    visual_tolerance
+        Pixels, 0 for none: codes move to neighbors that compress better where that shows no more than a bit's worth, the
+        shift of an opaque round splat by so many pixels in a picture in which the scene spans 1,000.
     seed
         Of the sample that codebooks are fitted on, where there are too many splats to take all.
     """
@@ -52,6 +56,7 @@ class SogOptions:
     rotation: RotationMode = "best"
     palette_rounds: int = 5
     webp_effort: int = DEFAULT_EFFORT
+    visual_tolerance: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -60,6 +65,8 @@ class SogOptions:
         _check_range("sh_palette_size", self.sh_palette_size, 1, MAX_PALETTE)
         _check_range("palette_rounds", self.palette_rounds, 0, 100)
         _check_range("webp_effort", self.webp_effort, 0, 9)
+        if not 0 <= self.visual_tolerance <= MAX_PIXELS:
+            raise CapabilityError(f"visual_tolerance must be 0 to {MAX_PIXELS:g} pixels, got {self.visual_tolerance}")
 
 
 KNOBS: dict[str, Knob] = {

@@ -14,7 +14,7 @@ from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog4d.bundle import Bundle
 from gsplat_tools.formats.sog4d.meta import frame_path
 from gsplat_tools.formats.sog4d.textures import indices_of, pixels_of
-from gsplat_tools.ops.visibility import MAX_TURN, MOST
+from gsplat_tools.ops.visibility import MAX_TURN, MOST, allowed_error
 
 _ROUNDING = 2.0**-22
 """Relative slack for float32 results: two units in the last place."""
@@ -67,7 +67,8 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
     turned = extra = None
     if meta.tolerance is not None:
         costs = meta.tolerance.costs(source, source.log_scales)
-        means = np.maximum(means, allowed_error(costs.position)[:, None] + np.maximum(np.abs(low), np.abs(high)) * _ROUNDING)
+        shift = np.minimum(allowed_error(costs.position)[:, None], high - low)
+        means = np.maximum(means, shift + np.maximum(np.abs(low), np.abs(high)) * _ROUNDING)
         opacities = np.maximum(opacities, allowed_error(costs.opacity))
         sh0 = np.maximum(sh0, allowed_error(costs.color)[:, None] * (1 + _ROUNDING))
         extra = MOST / costs.scale * (1 + _LABEL_SLACK)  # labels are chosen in float32
@@ -85,12 +86,6 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
         "scales": _distance(np.sort(logs, axis=1), np.sort(least, axis=1), np.sort(largest, axis=1)),
         "covariances": covariances,
     }
-
-
-def allowed_error(costs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the largest change that a visual tolerance allows beyond rounding, from its cost per square."""
-    allowed: NDArray[np.float64] = np.sqrt(MOST / costs) * (1 + _ROUNDING)
-    return allowed
 
 
 def turned_share(log_scales: NDArray[np.float32], costs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -116,15 +116,16 @@ def relaxed(
     ends: tuple[Float32, Float32],
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return codes of positions, rotations and colors that compress better, or the plain ones where they do not."""
+    from gsplat_tools.formats._relaxing import relaxed_colors, smaller
     from gsplat_tools.formats.sog4d import relaxing
 
     layout = (shared.width, shared.height)
     codes, rotations, colors = plain
     positions = relaxing.positions(cloud.means, *ends, codes, costs)
-    codes = relaxing.smaller(positions, codes, layout)
+    codes = smaller(positions, codes, layout)
     if shared.options.rotation != "reference":
-        rotations = relaxing.smaller(relaxing.rotations(quats, shared.is_long, rotations, costs), rotations, layout)
-    colors = relaxing.smaller(relaxing.colors(cloud, shared.sh0_codebook, colors, costs), colors, layout)
+        rotations = smaller(relaxing.rotations(quats, shared.is_long, rotations, costs), rotations, layout)
+    colors = smaller(relaxed_colors(cloud, shared.sh0_codebook, colors, costs), colors, layout)
     return codes, rotations, colors
 
 

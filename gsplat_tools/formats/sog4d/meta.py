@@ -123,12 +123,7 @@ def meta_text(meta: Meta) -> bytes:
         "streams": streams,
     }
     if meta.tolerance is not None:  # a field of ours, which readers ignore
-        view = meta.tolerance.view
-        root["visualTolerance"] = {
-            "pixels": meta.tolerance.pixels,
-            "center": dict(zip(AXES, view.center, strict=True)),
-            "radius": view.radius,
-        }
+        root["visualTolerance"] = meta.tolerance.to_json()
     return _text(root).encode()
 
 

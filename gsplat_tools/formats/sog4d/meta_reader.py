@@ -15,7 +15,7 @@ from gsplat_tools.formats._webp import MAX_SIDE
 from gsplat_tools.formats._zip import is_relative_name
 from gsplat_tools.formats.sog4d.meta import AXES, FRAME_TOKEN, Float32, Meta, PaletteMeta, Segment
 from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, MAX_PALETTE, SH0_ENTRIES
-from gsplat_tools.ops.visibility import MAX_PIXELS, Tolerance, Viewpoint
+from gsplat_tools.ops.visibility import tolerance_from_json
 
 
 def parse_meta(data: bytes) -> tuple[Meta | None, list[Issue]]:
@@ -122,7 +122,7 @@ class _Reader:
             sh0_codebook=sh[2],
             palettes=sh[3],
             generator=generator if isinstance(generator, str) else None,
-            tolerance=_tolerance(root.get("visualTolerance")),
+            tolerance=tolerance_from_json(root.get("visualTolerance")),
         )
 
     def _times(self, root: dict[str, Any], frames: int) -> NDArray[np.float64] | None:
@@ -386,15 +386,3 @@ def _nulls(root: dict[str, Any]) -> list[Issue]:
         return []
     message = f"{len(paths)} values are null, which Unity does not read; leave the fields out"
     return [Issue(code="json-null", message=message, field=f"meta.json {min(paths)}", count=len(paths))]
-
-
-def _tolerance(value: Any) -> Tolerance | None:
-    """Return the tolerance that a bundle was written with; anything that our writer does not write counts as none."""
-    try:
-        center = tuple(float(value["center"][axis]) for axis in AXES)
-        pixels, radius = float(value["pixels"]), float(value["radius"])
-    except (TypeError, KeyError, ValueError, OverflowError):
-        return None
-    if not (0 < pixels <= MAX_PIXELS and 0 < radius < math.inf and all(map(math.isfinite, center))):
-        return None
-    return Tolerance(pixels, Viewpoint((center[0], center[1], center[2]), radius))
