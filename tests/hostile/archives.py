@@ -7,7 +7,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from random import Random
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from tests.hostile.mutations import json_change
+from tests.hostile.mutations import json_change, json_fields
 from tests.hostile.seed import Span
 
 NAMES = (
@@ -147,6 +147,21 @@ def zip_rebuilder(data: bytes) -> Callable[[Random], bytes]:
         return zip_file(entries, **whole)
 
     return rebuild
+
+
+def zip_relatives(data: bytes, *more: Mapping[str, Callable[[], bytes]]) -> Callable[[], Iterator[tuple[str, bytes]]]:
+    """Return a function that yields an archive with every field of its meta.json changed, and files that break a rule."""
+
+    def relatives() -> Iterator[tuple[str, bytes]]:
+        for files in more:
+            for name, build in files.items():
+                yield name, build()
+        sound = entries_of(data)
+        index = next(i for i, entry in enumerate(sound) if entry.name.endswith(b"meta.json"))
+        for what, text in json_fields(sound[index].data):
+            yield what, zip_file([*sound[:index], replace(sound[index], data=text), *sound[index + 1 :]])
+
+    return relatives
 
 
 def changed_content(entry: Entry, rng: Random) -> bytes:

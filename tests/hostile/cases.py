@@ -27,9 +27,9 @@ def cases(format_id: str, start: int, stop: int) -> Iterator[Case]:
     position = 0
     for seed, count in systematic_counts(format_id):
         if start < position + count and position < stop:
-            for offset, (what, data) in enumerate(systematic(seed)):
+            for offset, (what, data) in enumerate(_sealed(seed)):
                 if start <= position + offset < stop:
-                    yield Case(position + offset, seed, what, seed.seal(data))
+                    yield Case(position + offset, seed, what, data)
         position += count
     for index in range(max(start, position), stop):
         yield make_mutant(format_id, index)
@@ -49,10 +49,24 @@ def make_mutant(format_id: str, index: int) -> Case:
     return Case(index, seed, "mutant", seed.seal(mutant(seed, rng)))
 
 
+def _sealed(seed: Seed) -> Iterator[tuple[str, bytes]]:
+    """Yield the systematic cases of a seed, its relatives first."""
+    yield from seed.relatives()
+    for what, data in systematic(seed):
+        yield what, seed.seal(data)
+
+
+def relatives(format_id: str) -> Iterator[Case]:
+    """Yield the hostile files of a format that are named one by one."""
+    for seed in seeds_of(format_id):
+        for what, data in seed.relatives():
+            yield Case(-1, seed, what, data)
+
+
 @cache
 def systematic_counts(format_id: str) -> tuple[tuple[Seed, int], ...]:
     """Return each seed and how many systematic cases it gives."""
-    return tuple((seed, sum(1 for _ in systematic(seed))) for seed in seeds_of(format_id))
+    return tuple((seed, sum(1 for _ in systematic(seed)) + sum(1 for _ in seed.relatives())) for seed in seeds_of(format_id))
 
 
 def num_systematic(format_id: str) -> int:
@@ -67,9 +81,9 @@ def sample(format_id: str, count: int) -> Iterator[Case]:
     chosen = {total * i // wanted for i in range(wanted)}
     position = 0
     for seed, number in systematic_counts(format_id):
-        for offset, (what, data) in enumerate(systematic(seed)):
+        for offset, (what, data) in enumerate(_sealed(seed)):
             if position + offset in chosen:
-                yield Case(position + offset, seed, what, seed.seal(data))
+                yield Case(position + offset, seed, what, data)
         position += number
     for index in range(total, total + count - wanted):
         yield make_mutant(format_id, index)

@@ -9,7 +9,7 @@ import tempfile
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.registry import FORMATS
 from tests.clouds import random_cloud
 from tests.hostile import archives, rebuilders
+from tests.hostile.mutations import json_fields
 from tests.hostile.seed import Seed, Span
 
 
@@ -53,6 +54,7 @@ def _written(record: Format) -> Iterator[Seed]:
                 rebuild=(rebuilders.text(text),),
                 beside=files,
                 target=next(iter(files)),
+                relatives=partial(json_fields, text),
             )
         rebuild = (archives.zip_rebuilder(data),) if data[:2] == b"PK" else ()
         yield Seed(
@@ -168,6 +170,14 @@ def seal_gspk(data: bytes) -> bytes:
     return data[:32] + struct.pack("<I", zlib.crc32(text)) + data[36:]
 
 
+def _descriptions(data: bytes) -> Iterator[tuple[str, bytes]]:
+    """Yield a file whose description comes last with every field of it changed."""
+    offset, length = struct.unpack_from("<QQ", data, 16)
+    for what, text in json_fields(data[offset : offset + length]):
+        header = data[:8] + struct.pack("<QQQ", offset + len(text), offset, len(text)) + data[32:offset]
+        yield what, seal_gspk(header + text)
+
+
 def _gspk(layout: str) -> Callable[[], list[Seed]]:
     def build() -> list[Seed]:
         sound = rebuilders.gspk_file(layout)
@@ -175,7 +185,7 @@ def _gspk(layout: str) -> Callable[[], list[Seed]]:
         return [
             Seed("by hand", "scene.gspk", sound, gspk_spans(sound), seal_gspk, (rebuilders.gspk(layout),)),
             Seed("by hand, not sealed", "scene.gspk", sound, (Span(0, 64),)),
-            Seed("description last", "scene.gspk", tail, gspk_spans(tail), seal_gspk),
+            Seed("description last", "scene.gspk", tail, gspk_spans(tail), seal_gspk, relatives=partial(_descriptions, tail)),
         ]
 
     return build
@@ -252,8 +262,23 @@ def _sog4d() -> list[Seed]:
             files[f"frames/{frame:05d}/labels{band}.webp"] = bundles.image([(i % 2, 0) for i in range(bundles.SPLATS)])
     two = bundles.archive(meta, files, compression=8)
     return [
-        Seed("version 1, deltas", "scene.sog4d", one, archives.spans_of(one), archives.seal, (archives.zip_rebuilder(one),)),
-        Seed("version 2, deflated", "scene.sog4d", two, archives.spans_of(two)[-1:], rebuild=(archives.zip_rebuilder(two),)),
+        Seed(
+            "version 1, deltas",
+            "scene.sog4d",
+            one,
+            archives.spans_of(one),
+            archives.seal,
+            (archives.zip_rebuilder(one),),
+            relatives=archives.zip_relatives(one, bundles.BROKEN),
+        ),
+        Seed(
+            "version 2, deflated",
+            "scene.sog4d",
+            two,
+            archives.spans_of(two)[-1:],
+            rebuild=(archives.zip_rebuilder(two),),
+            relatives=archives.zip_relatives(two),
+        ),
     ]
 
 
@@ -280,7 +305,8 @@ def _sog() -> list[Seed]:
     seeds = []
     for name, files in (("version 2", version_2(1)), ("version 1", version_1(1)), ("version 2, plain", version_2(0))):
         data = archive(files)
-        seeds.append(Seed(name, "scene.sog", data, archives.spans_of(data), archives.seal, (archives.zip_rebuilder(data),)))
+        rebuild, relatives = (archives.zip_rebuilder(data),), archives.zip_relatives(data)
+        seeds.append(Seed(name, "scene.sog", data, archives.spans_of(data), archives.seal, rebuild, relatives=relatives))
     packed = archive(version_2(1), deflated=True, prefix="folder/")
     seeds.append(
         Seed(
@@ -294,7 +320,8 @@ def _sog() -> list[Seed]:
     files = version_2(0)
     meta = files.pop("meta.json")
     whole = tuple(archives.text_spans(meta, 0, len(meta)))
-    seeds.append(Seed("folder", "meta.json", meta, whole, rebuild=(rebuilders.text(meta),), beside=files))
+    rebuild = (rebuilders.text(meta),)
+    seeds.append(Seed("folder", "meta.json", meta, whole, rebuild=rebuild, beside=files, relatives=partial(json_fields, meta)))
     beside = {f"a/{name}": data for name, data in version_2(0).items()} | {
         "b.sog": archive(version_2(1)),
         "env.sog": archive(version_1(1)),
@@ -306,8 +333,9 @@ def _sog() -> list[Seed]:
     }
     lod = {"lodLevels": 2, "counts": [4, 5], "filenames": ["a/meta.json", "b.sog"], "environment": "env.sog", "tree": tree}
     text = json.dumps(lod).encode()
+    whole, rebuild = (Span(0, len(text), "text"),), (rebuilders.text(text),)
     seeds.append(
-        Seed("levels", "lod-meta.json", text, (Span(0, len(text), "text"),), rebuild=(rebuilders.text(text),), beside=beside)
+        Seed("levels", "lod-meta.json", text, whole, rebuild=rebuild, beside=beside, relatives=partial(json_fields, text))
     )
     return seeds
 

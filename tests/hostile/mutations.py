@@ -196,6 +196,21 @@ def _change_value(root: Any, rng: Random) -> None:
         parent[key] = json.loads(json.dumps(rng.choice(VALUES)))
 
 
+def json_fields(text: bytes) -> Iterator[tuple[str, bytes]]:
+    """Yield every value of a JSON text removed, and as each of a few others."""
+    for index, (holder, key) in enumerate(_places(json.loads(text))):
+        if isinstance(holder, list) and len(holder) > 8 and key not in {0, len(holder) - 1}:
+            continue  # the ends stand for the others
+        for value in (..., None, True, -1, 1 << 40, 10**400, 0.5, 1e308, "x", [], {}, [1, 2, 3, 4], ["a/b", "c"], {"x": 1}):
+            root = json.loads(text)
+            parent = list(_places(root))[index][0]
+            if value is ...:
+                del parent[key]
+            else:
+                parent[key] = value
+            yield f"{key!r} as {str(value)[:20]}", json.dumps(root).encode()
+
+
 def nested(depth: int) -> Any:
     """Return lists in lists."""
     value: Any = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from random import Random
 from typing import Literal
@@ -33,6 +33,7 @@ class Seed:
     seal        makes checksums right again, or compresses, so that a change reaches the code behind them
     rebuild     each assembles a hostile relative of the file, field by field
     beside      files that lie in the same folder
+    relatives   hostile files that are named one by one, sealed
     target      the file that is read, where it is not this one but refers to it
     """
 
@@ -44,3 +45,4 @@ class Seed:
     rebuild: tuple[Callable[[Random], bytes], ...] = ()
     beside: Mapping[str, bytes] = field(default_factory=dict)
     target: str | None = None
+    relatives: Callable[[], Iterable[tuple[str, bytes]]] = tuple
