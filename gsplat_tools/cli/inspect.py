@@ -13,6 +13,7 @@ from gsplat_tools.cli import _output as output
 from gsplat_tools.cli._errors import EXIT_DATA, one_line, reports_errors
 from gsplat_tools.cli._numerics import numerics
 from gsplat_tools.cli._tradeoff import tradeoff
+from gsplat_tools.cli._view import view
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
@@ -289,6 +290,7 @@ def normalize(file: Path, *, target: Path | None, overwrite: bool) -> None:
 
 main.add_command(numerics)
 main.add_command(tradeoff)
+main.add_command(view)
 
 
 if __name__ == "__main__":

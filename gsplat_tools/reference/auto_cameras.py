@@ -55,8 +55,8 @@ def auto_cameras(cloud: GaussianCloud, *, views: int = 8, size: tuple[int, int] 
     """
     if views < 1:
         raise ValueError(f"views must be at least 1, got {views}")
-    center, radius = _robust_sphere(cloud)
-    axes = _world_axes(cloud.coordinate_system)
+    center, radius = robust_sphere(cloud)
+    axes = world_axes(cloud.coordinate_system)
     width, height = size
     # The sphere fits the narrower side of the picture.
     half_fov = math.atan(math.tan(math.radians(_FOV_Y) / 2) * min(1.0, width / height))
@@ -94,7 +94,7 @@ def _mirrored(camera: Camera) -> Camera:
     return Camera(viewmat, camera.K, camera.width, camera.height, camera.near, camera.far)
 
 
-def _robust_sphere(cloud: GaussianCloud) -> tuple[NDArray[np.float64], float]:
+def robust_sphere(cloud: GaussianCloud) -> tuple[NDArray[np.float64], float]:
     """Return center and radius of the visible bulk of a scene, in world coordinates."""
     step = max(1, -(-len(cloud) // _MAX_SAMPLES))
     means = cloud.means[::step].astype(np.float64)
@@ -126,7 +126,7 @@ def _weighted_quantile(values: NDArray[np.float64], weights: NDArray[np.float64]
     return float(values[order[np.searchsorted(cumulative, share * cumulative[-1])]])
 
 
-def _world_axes(coordinate_system: str) -> NDArray[np.float64]:
+def world_axes(coordinate_system: str) -> NDArray[np.float64]:
     """Return the directions right, up and back in the world of an axis-letter system; RDF where it is unknown."""
     rows = {"R": (0, 1), "L": (0, -1), "U": (1, 1), "D": (1, -1), "B": (2, 1), "F": (2, -1)}
     letters = coordinate_system if {rows.get(c, (9, 0))[0] for c in coordinate_system} == {0, 1, 2} else "RDF"
