@@ -192,6 +192,65 @@ def convert(
     )
 
 
+def estimate(
+    sources: Sequence[str | Path],
+    target: str | Path,
+    *,
+    to: str | None = None,
+    preset: str = DEFAULT_PRESET,
+    validation: Validation | None = Validation(),
+    time_at: float | None = None,
+    frame: int | None = None,
+    interpolation: Interpolation = "linear",
+    motion: Motion = DEFAULT_MOTION,
+    read_options: dict[str, Any] | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """Estimate what a conversion would give, from a part of the scene; nothing is written.
+
+    Parameters
+    ----------
+    sources, target, to, preset, time_at, frame, interpolation, motion, read_options
+        As `convert` takes them.
+    validation
+        Its views and their size are those that PSNR is estimated for; None estimates none.
+    **options
+        Choices of `SaveChoices` and write options of the target's format.
+
+    Returns
+    -------
+    dict
+        source, target, and the fields of `Prediction`.
+
+    Raises
+    ------
+    GsplatError
+        See `load` and `save`.
+    """
+    from gsplat_tools.tuning.measuring import Setting
+    from gsplat_tools.tuning.prediction import predict
+
+    record = find_target(Path(target), to)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GsplatWarning)
+        with _open(sources, False, read_options or {}, options) as (opened, source_format):
+            scene, _ = retime(opened, record, motion, time_at, frame, interpolation, options)
+            cloud = scene.read() if isinstance(scene, CloudChunks) else scene
+            valid = cloud if isinstance(cloud, GaussianSequence) else drop_or_refuse(cloud, strict=False)
+            found = predict(
+                valid,
+                Setting(format=record.id, preset=preset, options=options),
+                views=0 if validation is None else validation.views,
+                size=VALIDATION_SIZE if validation is None else validation.size,
+            )
+    return {
+        "source": ", ".join(map(str, sources)),
+        "source_format": source_format,
+        "target": {"path": str(target), "format": record.id},
+        **found.to_json(),
+    }
+
+
 def _rendered_clip(scene: Scene, options: dict[str, Any]) -> Any:
     """Return the int8 ranges that render best."""
     from gsplat_tools.tuning.precision import choose_clip

@@ -67,6 +67,11 @@ FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
         "type": click.IntRange(0, 2**32 - 1), "help": "Splats of the models before this one, in the sidecar.",
     }),
     ("--level", "level", {"type": click.IntRange(1, 22), "help": "Level of zstd or zlib."}),
+    ("--visual-tolerance", "visual_tolerance", {
+        "type": options.FiniteType(0, 10), "metavar": "PX",
+        "help": "Move codes to cheap neighbors where no bit saved shows more than an opaque splat shifted by so many px, in a "
+        "picture that the scene spans with 1,000 px; try 0.02 to 0.1. 0 changes nothing.",
+    }),
     ("--seed", "seed", {"type": int, "help": "Seed of everything random."}),
 )  # fmt: skip
 
@@ -175,6 +180,7 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 @click.option("--model", type=click.Choice(options.MODELS), help="Rendering model to validate with; by default the target's.")
 @options.jobs_option
 @options.max_memory_option
+@click.option("--dry-run", is_flag=True, help="Estimate bytes, seconds and PSNR from a part of the scene; write nothing.")
 @click.option("--overwrite", is_flag=True, help="Replace a target that is there.")
 @options.json_option
 @click.option("--quiet", is_flag=True, help="Print errors only.")
@@ -186,6 +192,7 @@ def main(
     target: Path,
     formats: tuple[str, ...],
     *,
+    dry_run: bool,
     overwrite: bool,
     as_json: bool,
     quiet: bool,
@@ -206,7 +213,7 @@ def main(
     gsplat-convert 'frames/*.ply' scene.sog4d
     gsplat-convert scene.sog4d frames/ --to ply
     """  # noqa: D301 - \b keeps click from joining the lines
-    from gsplat_tools.convert import convert
+    from gsplat_tools.convert import convert, estimate
     from gsplat_tools.parallel import use_jobs
 
     for source in sources:
@@ -219,6 +226,11 @@ def main(
     reports = []
     with use_jobs(jobs), output.showing_progress(progress and not quiet):
         for (path, to), own in zip(targets, arguments, strict=True):
+            if dry_run:
+                reports.append(estimate(sources, path, to=to, **own))
+                if not as_json:
+                    click.echo(_estimated(reports[-1]))
+                continue
             report = convert(sources, path, to=to, overwrite=overwrite, **own)
             reports.append(report.to_json())
             if not quiet:
@@ -305,6 +317,22 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
         **({"frame_times": given["frame_times"]} if given["frame_times"] else {}),
     }
     return [{**shared, **{name: value for flag, name, value in own if _takes(record, flag, name)}} for record in records]
+
+
+def _estimated(report: dict[str, Any]) -> str:
+    """Return an estimate in words."""
+    level = "identical pictures" if report["psnr_min"] is None else f"PSNR min {report['psnr_min']:.1f} dB"
+    if report["exact"]:
+        basis = "measured on the whole scene"
+    else:
+        basis = f"from {output.count(report['sampled_splats'])} of {output.count(report['splats'])} splats"
+        if report["frames"] > 1:
+            basis += f" in {report['sampled_frames']} of {report['frames']} frames"
+    return (
+        f"{report['source']} -> {report['target']['path']} ({report['target']['format']}), not written: "
+        f"{'' if report['exact'] else 'about '}{output.count(report['bytes'])} bytes, "
+        f"{report['encode_seconds']:.2f} s to encode, {level}; {basis}"
+    )
 
 
 def _summary(report: dict[str, Any]) -> str:
