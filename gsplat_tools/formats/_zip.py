@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Collection, Iterator
 from typing import BinaryIO, Literal
 
-from gsplat_tools.errors import CorruptDataError, LimitExceededError
+from gsplat_tools.errors import CorruptDataError, LimitExceededError, ReadError
 from gsplat_tools.formats._issues import Issue, Rule, raise_errors, refuse
 from gsplat_tools.formats._limits import MAX_EXPANSION, max_memory
 
@@ -70,6 +70,7 @@ class ZipReader:
         try:
             self._archive = zipfile.ZipFile(stream)
         except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError, OverflowError, struct.error) as error:
+            raise_read_error(error)
             message = f"expected a ZIP archive, found none that can be opened ({error}); copy or download the file again"
             raise refuse(Issue(code="zip-invalid", message=message, field="archive", offset=0), RULES) from error
         issues = list(check_directory(self._archive.infolist(), self._archive.start_dir, repeatable))
@@ -125,12 +126,20 @@ class ZipReader:
                 data = entry.read(info.file_size)
                 entry.read(1)
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError, RuntimeError) as error:
+            raise_read_error(error)
             issue = Issue(code="zip-entry-corrupt", message=f"the entry does not decompress ({error})", field=name, frame=frame)
             raise refuse(issue, RULES) from error
         if len(data) != info.file_size:
             message = f"the entry holds {len(data)} bytes, its record says {info.file_size}"
             raise refuse(Issue(code="zip-entry-corrupt", message=message, field=name, frame=frame), RULES)
         return data
+
+
+def raise_read_error(error: BaseException) -> None:
+    """Raise what the disk was at fault for, which zipfile takes for a fault of the archive."""
+    for cause in (error, error.__context__):
+        if isinstance(cause, ReadError):
+            raise cause
 
 
 def check_directory(entries: list[zipfile.ZipInfo], directory_offset: int, repeatable: Collection[str] = ()) -> Iterator[Issue]:
