@@ -83,7 +83,7 @@ def half_covariance_losses(covariances: NDArray[Any]) -> CovarianceLosses:
     )
 
 
-def count_lost_needles(quats: NDArray[Any], log_scales: NDArray[Any]) -> int:
+def count_lost_needles(quats: NDArray[Any], log_scales: NDArray[Any], covariances: NDArray[np.float32] | None = None) -> int:
     """Count the splats whose smallest axis half precision loses: needles and discs that come back flat.
 
     Parameters
@@ -91,13 +91,17 @@ def count_lost_needles(quats: NDArray[Any], log_scales: NDArray[Any]) -> int:
     quats, log_scales
         (N, 4) wxyz and (N, 3) natural logs, -inf is flat. Covariances are rounded to float32 and then to halves, as
         Visionary's loaders do.
+    covariances
+        (N, 6) of these splats where they are at hand already.
 
     Notes
     -----
     As `half_covariance_losses(...).vanished`, by the signs of the leading minors of the rounded matrix (Sylvester) in place
     of its eigenvalues: halves have 11 bits, so that float64 holds the products.
     """
-    xx, xy, xz, yy, yz, zz = to_halves(covariance_triangles(quats, log_scales)).astype(np.float64).T
+    if covariances is None:
+        covariances = np.asarray(covariance_triangles(quats, log_scales), np.float32)
+    xx, xy, xz, yy, yz, zz = to_halves(covariances).astype(np.float64).T
     with np.errstate(invalid="ignore", over="ignore"):
         minor = xx * yy - xy * xy
         determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)

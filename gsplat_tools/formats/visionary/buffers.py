@@ -276,7 +276,7 @@ def encode(
             values = np.concatenate([block.sh0[:, None], block.shN], axis=1)
             fitting = np.clip(values, -largest, largest)
             colors[part] = codec.encode_sh(fitting[:, 0], fitting[:, 1:], precision=precision, layout=options.sh_layout)
-        needles = codec.count_lost_needles(block.quats, block.log_scales) if precision == "f16" else 0
+        needles = codec.count_lost_needles(block.quats, block.log_scales, covariances) if precision == "f16" else 0
         counts[start // BLOCK_SIZE] = (
             needles,
             np.count_nonzero(is_shrunk),
@@ -333,16 +333,19 @@ def bounds(source: GaussianCloud, stream: BinaryIO, _frame: int, precision: Prec
     is_raw = companion is not None and companion.get("color") == "raw"
     true = covariance_triangles(source.quats, source.log_scales, dtype=np.float64)
     stored = _fitting(source, precision)[0]
-    moved = np.abs(stored - true) + _rounding(stored, precision)
-    error = np.sqrt((moved**2 * [1, 2, 2, 1, 2, 1]).sum(axis=1))
-    norms = np.sqrt((true**2 * [1, 2, 2, 1, 2, 1]).sum(axis=1))
     logs = np.sort(source.log_scales.astype(np.float64), axis=1)
-    squares = np.exp(2 * logs)
-    noise = error[:, None] + _EIGEN_NOISE * squares[:, 2:]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        moved = np.abs(stored - true) + _rounding(stored, precision)
+        error = np.sqrt((moved**2 * [1, 2, 2, 1, 2, 1]).sum(axis=1))
+        norms = np.sqrt((true**2 * [1, 2, 2, 1, 2, 1]).sum(axis=1))
+        squares = np.exp(2 * logs)
+        noise = error[:, None] + _EIGEN_NOISE * squares[:, 2:]
         shares = np.divide(noise, squares, out=np.full_like(squares, np.inf), where=squares > 0)
         scales = np.where(shares < 1, -0.5 * np.log1p(-np.minimum(shares, 1.0)), np.inf)
         relative = np.divide(error, norms, out=np.where(error > 0, np.inf, 0.0), where=norms > 0) + _EIGEN_NOISE
+        # Beyond float64 all that is known is that a covariance shrinks, by no more than the whole of it.
+        is_beyond = ~np.isfinite(norms)
+        relative, scales = np.where(is_beyond, 1 + _EIGEN_NOISE, relative), np.where(is_beyond[:, None], np.inf, scales)
         sizes = np.where(np.isfinite(logs), np.abs(logs), 0.0)
         scales += (sizes + scales) * _HALF_STEP
         decoding = 2 * _HALF_STEP * (np.sqrt(8.0 / 3.0) + sizes[:, 2] + relative + 0.4)
