@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsplat_tools.attributes import activations
+from gsplat_tools.attributes import activations, quaternions
 from gsplat_tools.attributes.covariance import covariance_matrices
 from gsplat_tools.attributes.motion import positions_at, weights_at
 from gsplat_tools.attributes.spherical_harmonics import evaluate_colors
@@ -120,6 +120,22 @@ def test_ply_times__out_of_range_are_bounded_by_what_reading_clamps() -> None:
     assert np.allclose(limits["times"], [0.5, 0.0, 2.0])
     for name in ("times", "durations"):
         assert (np.abs(getattr(cloud, name) - getattr(decoded, name)) <= limits[name]).all()
+
+
+@pytest.mark.parametrize("length", [2.0**-100, 2.0**100])
+def test_visionary_rotations__do_not_depend_on_the_length_of_quaternions(length: float) -> None:
+    # Squares left float32, and the first frame was taken instead of the closest.
+    from gsplat_tools.codecs.visionary_int8 import sort_axes
+
+    cloud = random_cloud(200, sh_degree=0)
+    units = quaternions.normalize(cloud.quats.astype(np.float64))
+
+    (codes, logs), (expected, sorted_logs) = (
+        sort_axes((size * units).astype(np.float32), cloud.log_scales) for size in (length, 1.0)
+    )
+
+    assert np.array_equal(codes, expected)
+    assert np.array_equal(logs, sorted_logs)
 
 
 # -- far from zero

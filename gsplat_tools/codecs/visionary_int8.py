@@ -147,7 +147,7 @@ def calibrated_ranges(values: NDArray[Any], weights: NDArray[Any], sizes: NDArra
             return
         order = np.argsort(column, kind="stable")
         column, own = column[order], weights[is_finite][order]
-        gain = np.ones(len(column)) if logs is None else np.exp(2 * (column - logs[is_finite][order]))
+        gain = np.ones(len(column)) if logs is None else np.exp(np.minimum(2 * (column - logs[is_finite][order]), 0.0))
         weightings = [own * gain, np.sqrt(own) * gain, gain]
         low[channel], high[channel] = _best_ends(column, weightings, low[channel], high[channel], is_log=logs is not None)
 
@@ -211,7 +211,7 @@ def sort_axes(quats: Float32, log_scales: Float32) -> tuple[NDArray[np.int8], Fl
                 frames_of[frame_id, order_id] = matching[frame_id]
     order_ids = order @ (9, 3, 1)
     codes, turned = np.empty((len(quats), 4), np.uint8), np.empty_like(quats)
-    scales, closest = np.empty_like(log_scales), np.full(len(quats), -1.0, np.float32)
+    scales, closest = np.empty_like(log_scales), np.full(len(quats), -1.0)
     for frames_by_order in frames_of:
         frames = frames_by_order[order_ids]
 
@@ -222,8 +222,9 @@ def sort_axes(quats: Float32, log_scales: Float32) -> tuple[NDArray[np.int8], Fl
         run_blocks(turn, len(quats))
         candidates = quaternion_u8.encode(turned)
         with np.errstate(invalid="ignore", divide="ignore"):
-            lengths = np.sqrt(np.square(turned).sum(axis=1))
-            closeness = np.abs((quaternion_u8.decode(candidates) * turned).sum(axis=1)) / lengths
+            wide = turned.astype(np.float64)  # squares of float32 overflow and vanish
+            lengths = np.sqrt(np.square(wide).sum(axis=1))
+            closeness = np.abs((quaternion_u8.decode(candidates) * wide).sum(axis=1)) / lengths
         is_closer = closeness > closest
         codes[is_closer], closest[is_closer] = candidates[is_closer], closeness[is_closer]
     codes[closest < 0] = quaternion_u8.encode(quats[closest < 0])
