@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 from dataclasses import dataclass
+from functools import cache
 from typing import cast
 
 import numpy as np
@@ -12,6 +14,9 @@ from numpy.typing import NDArray
 
 from gsplat_tools.errors import CorruptDataError, MissingDependencyError, TruncatedDataError
 from gsplat_tools.remembering import remembered
+
+SOUND_LIBWEBP = (1, 3, 2)
+"""Earlier versions of libwebp do not decode hostile files safely."""
 
 MAX_SIDE = 16383
 """Largest width and height of a WebP image (RFC 9649: 14 bits each)."""
@@ -134,6 +139,7 @@ def decode_rgba(data: bytes, width: int, height: int, *, field: str, frame: int 
     MissingDependencyError
         Pillow was built without libwebp.
     """
+    require_sound_library()
     header = parse_header(data, field=field, frame=frame)
     if (header.width, header.height) != (width, height):
         raise CorruptDataError(
@@ -159,6 +165,30 @@ def decode_rgba(data: bytes, width: int, height: int, *, field: str, frame: int 
             frame=frame,
         )
     return cast("Image", pixels)
+
+
+@cache
+def require_sound_library() -> None:
+    """Refuse a libwebp that writes beyond its buffers when it decodes what a hostile file holds.
+
+    Raises
+    ------
+    MissingDependencyError
+        It is older than 1.3.2.
+
+    Source
+    ------
+    CVE-2023-4863: heap buffer overflow in the Huffman tables of lossless images, corrected in libwebp 1.3.2.
+    """
+    from PIL import features
+
+    version = features.version("webp")
+    found = tuple(int(part) for part in re.findall(r"\d+", version or "")[:3])
+    if found and found < SOUND_LIBWEBP:
+        raise MissingDependencyError(
+            f"libwebp {version} can be taken over by hostile images (CVE-2023-4863); install Pillow 10.0.1 or later, or "
+            f"libwebp {'.'.join(map(str, SOUND_LIBWEBP))}"
+        )
 
 
 def _has_lossless_chunk(data: bytes) -> bool:

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, features
 
-from gsplat_tools.errors import CorruptDataError, FormatError
+from gsplat_tools.errors import CorruptDataError, FormatError, MissingDependencyError
+from gsplat_tools.formats import _webp
 from gsplat_tools.formats._webp import decode_rgba, encode_rgba, parse_header
 
 
@@ -102,3 +103,21 @@ def test_default_effort__finds_what_repeats_two_hundred_rows_later() -> None:
     once, twice = (len(encode_rgba(np.ascontiguousarray(np.tile(rows, (count, 1, 1))))) for count in (1, 2))
 
     assert twice < 1.1 * once
+
+
+@pytest.mark.parametrize(("version", "is_sound"), [("1.3.1", False), ("0.6.1", False), ("1.3.2", True), ("1.6.0", True)])
+def test_decode__refuses_a_library_that_hostile_images_take_over(
+    version: str, is_sound: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from PIL import features
+
+    monkeypatch.setattr(features, "version", {"webp": version}.get)
+    _webp.require_sound_library.cache_clear()
+    try:
+        if is_sound:
+            _webp.require_sound_library()
+        else:
+            with pytest.raises(MissingDependencyError, match="CVE-2023-4863"):
+                _webp.decode_rgba(b"", 1, 1, field="x")
+    finally:
+        _webp.require_sound_library.cache_clear()
