@@ -253,7 +253,10 @@ function readDelta(bytes, segment, palette, splatCount) {
 function decodeQuaternions(pixels, count) {
   const quats = new Float32Array(4 * count);
   for (let i = 0; i < 4 * count; i += 4) {
-    const [w, x, y, z] = [0, 1, 2, 3].map((k) => (pixels[i + k] - 128) / 128);
+    const w = (pixels[i] - 128) / 128;
+    const x = (pixels[i + 1] - 128) / 128;
+    const y = (pixels[i + 2] - 128) / 128;
+    const z = (pixels[i + 3] - 128) / 128;
     const length = Math.sqrt(w * w + x * x + y * y + z * z);
     const factor = length > 0 ? (w < 0 ? -1 : 1) / length : 0;
     quats[i] = length > 0 ? w * factor : 1;
@@ -280,6 +283,6 @@ function framePath(template, frame) {
   return template.replaceAll("{frame}", String(frame).padStart(5, "0"));
 }
 
-function vector({ x, y, z } = {}, ..._) {
+function vector({ x, y, z }) {
   return [x, y, z].map(Math.fround);
 }

@@ -120,27 +120,39 @@ export function packSplats({ means, logScales, quats, opacities, sh0 }, count, e
   const steps = 254 / (lnScaleMax - lnScaleMin);
   const scale = (log) =>
     log < FLAT_LN_SCALE ? 0 : Math.min(255, Math.max(1, Math.round((log - lnScaleMin) * steps) + 1));
-  for (let i = 0; i < count; i++) {
-    const [k, q] = [3 * i, 4 * i];
-    const [u, v, angle] = packRotation(quats[q], quats[q + 1], quats[q + 2], quats[q + 3]);
+  for (let i = 0, k = 0, q = 0; i < count; i++, k += 3, q += 4) {
+    const rotation = packRotation(quats[q], quats[q + 1], quats[q + 2], quats[q + 3]);
     words[q] =
       color(sh0[k]) | (color(sh0[k + 1]) << 8) | (color(sh0[k + 2]) << 16) | (Math.round(opacities[i] * 255) << 24);
     words[q + 1] = toHalf(means[k]) | (toHalf(means[k + 1]) << 16);
-    words[q + 2] = toHalf(means[k + 2]) | (u << 16) | (v << 24);
-    words[q + 3] = scale(logScales[k]) | (scale(logScales[k + 1]) << 8) | (scale(logScales[k + 2]) << 16) | (angle << 24);
+    words[q + 2] = toHalf(means[k + 2]) | ((rotation & 0xffff) << 16);
+    words[q + 3] =
+      scale(logScales[k]) | (scale(logScales[k + 1]) << 8) | (scale(logScales[k + 2]) << 16) | ((rotation >> 16) << 24);
   }
 }
 
-/** Octahedral axis and angle of a rotation. */
+/** Octahedral axis, two bytes, and angle, the third. */
 function packRotation(w, x, y, z) {
-  if (w < 0) [w, x, y, z] = [-w, -x, -y, -z];
+  if (w < 0) {
+    w = -w;
+    x = -x;
+    y = -y;
+    z = -z;
+  }
   const angle = Math.round((2 * Math.acos(Math.min(w, 1)) * 255) / Math.PI);
-  const length = Math.sqrt(x * x + y * y + z * z);
-  if (length < 1e-6) [x, y, z] = [1, 0, 0];
+  if (Math.sqrt(x * x + y * y + z * z) < 1e-6) {
+    x = 1;
+    y = z = 0;
+  }
   const sum = Math.abs(x) + Math.abs(y) + Math.abs(z);
-  let [px, py] = [x / sum, y / sum];
-  if (z < 0) [px, py] = [(1 - Math.abs(py)) * (px < 0 ? -1 : 1), (1 - Math.abs(px)) * (py < 0 ? -1 : 1)];
-  return [Math.round((px / 2 + 0.5) * 255), Math.round((py / 2 + 0.5) * 255), angle];
+  let px = x / sum;
+  let py = y / sum;
+  if (z < 0) {
+    const folded = (1 - Math.abs(py)) * (px < 0 ? -1 : 1);
+    py = (1 - Math.abs(px)) * (py < 0 ? -1 : 1);
+    px = folded;
+  }
+  return Math.round((px / 2 + 0.5) * 255) | (Math.round((py / 2 + 0.5) * 255) << 8) | (angle << 16);
 }
 
 /** Values of a band from `at` on, as signed codes one after another in a string of words. */
