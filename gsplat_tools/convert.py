@@ -7,7 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +16,7 @@ import numpy as np
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import AttributeTally, compare_rendered, paired, sample
+from gsplat_tools.comparison.rendered import MAX_RENDERED
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, ValidationError
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import drop_or_refuse, inspect_file, is_single, open_as, open_scene
@@ -24,7 +25,11 @@ from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, save
 from gsplat_tools.progress import stage
 from gsplat_tools.retiming import DEFAULT_MOTION, Motion, retime
 from gsplat_tools.sequence import GaussianSequence, Interpolation
+from gsplat_tools.tuning.auto import Tuned, tune, zero_bands
+from gsplat_tools.tuning.measuring import Workbench
+from gsplat_tools.tuning.search import TARGET_SIZE, TARGET_VIEWS, Budget
 
+EXACT_PRESET = "exact"
 VALIDATION_VIEWS = 2
 VALIDATION_SIZE = (320, 180)
 VALIDATED_FRAMES = 3
@@ -68,6 +73,8 @@ class ConversionReport:
     seconds: dict[str, float]
     validation: dict[str, Any] | None
     options: dict[str, Any] = field(default_factory=dict)
+    decisions: list[dict[str, Any]] = field(default_factory=list)
+    search: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the report with the fixed names of the command line's JSON."""
@@ -86,6 +93,8 @@ class ConversionReport:
                 name: value if isinstance(value, int | float | str | None) else str(value)
                 for name, value in self.options.items()
             },
+            "decisions": self.decisions,
+            "search": self.search,
         }
 
 
@@ -96,6 +105,8 @@ def convert(
     to: str | None = None,
     overwrite: bool = False,
     preset: str = DEFAULT_PRESET,
+    budget: Budget | None = None,
+    auto: bool = False,
     validation: Validation | None = Validation(),
     time_at: float | None = None,
     frame: int | None = None,
@@ -117,9 +128,15 @@ def convert(
     overwrite
         Replace a target that is there.
     preset
-        "fast", "balanced" or "best".
+        "fast", "balanced", "best", or "exact" for all that the format can hold.
+    budget
+        Search the options that were not given for the cheapest result that holds it; see `tuning.search`.
+    auto
+        Spend no more than the scene requires: search for fewer bytes than the preset's at pictures as good, as far as a
+        screen shows. Does nothing with a budget, which does as much, and with "exact", which keeps bits.
     validation
-        How to check the written file; None checks nothing.
+        How to check the written file; None checks nothing. What is searched for is judged by as many views as `compare`
+        draws, or more.
     time_at, frame, interpolation
         Take one moment or one stored frame of a sequence, or one moment of a 4D asset.
     motion
@@ -139,7 +156,8 @@ def convert(
     GsplatError
         See `load` and `save`.
     ValidationError
-        The written file leaves its bounds, or renders below `min_psnr`; the target is left as it was.
+        The written file leaves its bounds, renders below `min_psnr`, or nothing holds the budget; the target is left as
+        it was.
     """
     record = find_target(Path(target), to)
     outcome: dict[str, Any] = {}
@@ -149,7 +167,7 @@ def convert(
         assert validation is not None
         start = time.perf_counter()
         try:
-            outcome["validation"] = _validate(Path(stream.name), prepared.scene, written, validation)
+            outcome["validation"] = _validate(Path(stream.name), prepared.scene, written, validation, outcome.get("bench"))
         except GsplatError as error:
             error.path = Path(target)  # not the temporary file that was read back
             raise
@@ -161,6 +179,13 @@ def convert(
         in_chunks = record.streams and (options.get("order") or record.order) == "none"
         with _open(sources, in_chunks, read_options or {}, options) as (opened, source_format):
             scene, retimed = retime(opened, record, motion, time_at, frame, interpolation, options)
+            source_degree = scene.sh_degree
+            if budget is not None or (auto and preset != EXACT_PRESET):
+                how = _demanding(validation, budget)
+                validation = None if validation is None else how
+                tuned = _tune(scene, record, budget, preset, options, how)
+                scene, options = tuned.scene, {**options, **tuned.options}
+                outcome |= {"bench": tuned.bench, "decisions": tuned.decisions, "search": tuned.found and tuned.found.to_json()}
             seconds["read"] = time.perf_counter() - start
             if options.get("clip") == "rendered":
                 options["clip"] = _rendered_clip(scene, options)
@@ -175,6 +200,9 @@ def convert(
             )
     for name, spent in saved.seconds.items():
         seconds[name] += spent
+    decisions = outcome.get("decisions", [])
+    if saved.sh_degree < source_degree and options.get("sh_degree") in (None, "auto") and record.max_sh_degree >= source_degree:
+        decisions = [zero_bands(source_degree, saved.sh_degree), *decisions]
     return ConversionReport(
         source=", ".join(map(str, sources)),
         source_format=source_format,
@@ -189,6 +217,8 @@ def convert(
         seconds=seconds,
         validation=outcome.get("validation"),
         options={**saved.options, **retimed.facts},
+        decisions=decisions,
+        search=outcome.get("search"),
     )
 
 
@@ -261,6 +291,20 @@ def _rendered_clip(scene: Scene, options: dict[str, Any]) -> Any:
     return choose_clip(cloud, **{name: value for name, value in options.items() if name == "position_bits"}).clip
 
 
+def _demanding(how: Validation | None, budget: Budget | None) -> Validation:
+    """Return a validation with the views that a search is judged by, and the PSNR that it has to hold."""
+    how = how or Validation()
+    floors = [each for each in (how.min_psnr, None if budget is None else budget.min_psnr) if each is not None]
+    views = how.views if how.views != VALIDATION_VIEWS else TARGET_VIEWS
+    return replace(how, views=views, size=max(how.size, TARGET_SIZE), min_psnr=max(floors, default=None))
+
+
+def _tune(scene: Scene, record: Format, budget: Budget | None, preset: str, options: dict[str, Any], how: Validation) -> Tuned:
+    """Choose options by measurement."""
+    model = None if how.model is None else (how.model, None)
+    return tune(scene, record, preset=preset, options=options, budget=budget, views=how.views, size=how.size, model=model)
+
+
 @contextmanager
 def _open(
     sources: Sequence[str | Path], in_chunks: bool, read_options: dict[str, Any], options: dict[str, Any]
@@ -278,9 +322,15 @@ def _open(
 
 
 def _validate(
-    path: Path, source: GaussianCloud | CloudChunks | GaussianSequence, target: Format, how: Validation
+    path: Path,
+    source: GaussianCloud | CloudChunks | GaussianSequence,
+    target: Format,
+    how: Validation,
+    bench: Workbench | None = None,
 ) -> dict[str, Any]:
     """Read the file back, hold every value against its bound, render both sides, and judge.
+
+    Pictures are compared with those of what was given to the writer, or of the source where a bench has it.
 
     Raises
     ------
@@ -316,7 +366,11 @@ def _validate(
                 for a, b in paired(source, decoded):
                     tally.add(a, b, None if target.bounds is None else target.bounds(a, header, 0))
                     progress.advance(len(a))
-            pairs.append(("", sample(source), sample(decoded)))
+            limit = MAX_RENDERED if bench is None else max(1, len(source))
+            pairs.append(("", sample(source, limit), sample(decoded, limit)))
+    if bench is not None and pairs:
+        frames = bench.source_frames(pairs[0][1].coordinate_system)
+        pairs = [(label, frame, after) for frame, (label, _, after) in zip(frames, pairs, strict=True)]
     model = (how.model, None) if how.model is not None else target.model
     result: dict[str, Any] = {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None}
     pairs = [pair for pair in pairs if len(pair[1])]

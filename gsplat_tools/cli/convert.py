@@ -11,6 +11,7 @@ import click
 
 from gsplat_tools.cli import _options as options
 from gsplat_tools.cli import _output as output
+from gsplat_tools.cli import _tuning as tuning
 from gsplat_tools.cli._errors import one_line, reports_errors
 from gsplat_tools.errors import counts_in_words
 from gsplat_tools.formats.base import Format
@@ -105,11 +106,12 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 )
 @click.option(
     "--preset",
-    type=click.Choice(["fast", "balanced", "best"]),
+    type=click.Choice(["fast", "balanced", "best", "exact"]),
     default="balanced",
     show_default=True,
-    help="Speed, size and accuracy; every option below overrides it.",
+    help="Speed, size and accuracy; exact keeps all that the format can hold. Every option below overrides it.",
 )
+@tuning.tuning_options
 @click.option(
     "--sh-degree", type=options.DegreeType(), help="Highest SH band to keep; auto drops bands that are zero everywhere."
 )
@@ -227,7 +229,7 @@ def main(
     with use_jobs(jobs), output.showing_progress(progress and not quiet):
         for (path, to), own in zip(targets, arguments, strict=True):
             if dry_run:
-                reports.append(estimate(sources, path, to=to, **own))
+                reports.append(estimate(sources, path, to=to, **tuning.without_search(own)))
                 if not as_json:
                     click.echo(_estimated(reports[-1]))
                 continue
@@ -305,6 +307,8 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
     }
     shared = {
         "preset": given["preset"],
+        "budget": tuning.budget_of(given),
+        "auto": given["auto"],
         "validation": validation,
         "time_at": given["time_at"],
         "frame": given["frame"],
@@ -349,6 +353,7 @@ def _summary(report: dict[str, Any]) -> str:
         + ", ".join(f"{name} {value:.2f}" for name, value in seconds.items())
         + ")",
     ]
+    lines += tuning.summary(report)
     if report["dropped"]:
         lines.append(f"  dropped: {counts_in_words(report['dropped'])}")
     validation = report["validation"]

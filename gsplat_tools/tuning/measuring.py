@@ -264,6 +264,10 @@ class Workbench:
             for a, b in zip(references, images, strict=True)
         ]
 
+    def shows_anything(self, model: Model) -> bool:
+        """Whether any picture of the source is not black."""
+        return any(picture.any() for picture in self._reference(model, None)[1])
+
     def source_frames(self, system: str | None = None) -> list[GaussianCloud]:
         """Return the frames of the source that are drawn, one for a still scene, in the axes of a candidate."""
         from gsplat_tools.ops.coordinates import convert_coordinates

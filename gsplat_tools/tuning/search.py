@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import ValidationError
+from gsplat_tools.errors import GsplatError, ValidationError
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.knobs import Knob
 from gsplat_tools.formats.saving import DEFAULT_PRESET
-from gsplat_tools.progress import stage
+from gsplat_tools.progress import report_to, stage
 from gsplat_tools.remembering import remembering
 from gsplat_tools.sequence import GaussianSequence
 from gsplat_tools.tuning.measuring import Model, Workbench
@@ -32,6 +32,9 @@ SEARCH_FRAMES = 3
 _ROUNDS = 7
 _STEP = 0.1
 """What is asked for beyond the budget after a choice came up again, dB or tenths of the logarithm of the bytes."""
+
+_LOOSE = 0.5
+"""dB above the target from which the presets are tried as well, since the prediction does not fit the scene."""
 
 _TINY = 1e-12
 _CLOSE = 0.1
@@ -181,13 +184,18 @@ class Searcher:
         """Return the best encoding within a budget; as `search`, with the same errors."""
         start = time.perf_counter()
         keeps_splats = self._keeps_splats or budget.max_bytes_per_splat is not None
-        with remembering(), stage("searching", 0, "trials") as progress:
+        with remembering(), stage("searching", 0, "trials") as progress, report_to(None):
             if keeps_splats not in self._rates:
                 knobs = turnable(self._scene, self.whole.record, self.whole.fixed, keep_splats=keeps_splats)
                 self._rates[keeps_splats] = RateModel(self._part, knobs)
             hunt = _Hunt(self.whole, self._rates[keeps_splats], budget, _count(self._scene))
             found = hunt.run(progress.advance)
-            return hunt.report(found, time.perf_counter() - start)
+            options = hunt.presets(found[1])
+            report = hunt.report(found, time.perf_counter() - start)
+            if not options:
+                return report
+            trial = self.whole.encode(options)
+            return replace(report, options=options, bytes=trial.bytes, psnr_min=trial.level, decisions=[])
 
 
 def turnable(
@@ -201,7 +209,7 @@ def turnable(
     if not isinstance(pinned.get("sh_degree"), int):
         given.pop("sh_degree", None)
     degree = min(max(map(effective_sh_degree, frames)), record.max_sh_degree)
-    most = max(64, scene.num_splats // 4 if isinstance(scene, GaussianSequence) else len(scene) // 4)
+    most = max(64, scene.num_splats if isinstance(scene, GaussianSequence) else len(scene))
     if degree == 0:
         given["sh_degree"] = 0
     found: dict[str, Knob] = {}
@@ -237,9 +245,11 @@ class _Hunt:
         for _ in range(_ROUNDS):
             choice = self._propose(margin)
             if choice is None:
-                if best is None:
-                    return self._extreme()
-                break
+                if best is not None:
+                    break
+                best = self._extreme()  # which also corrects the prediction
+                advance(1)
+                continue
             if choice.places in self._verified:
                 if best is not None and choice.places == best[0].places and margin == 0:
                     break
@@ -252,6 +262,22 @@ class _Hunt:
                 if self._is_close(trial):
                     break
         return best or self._extreme()
+
+    def presets(self, best: Trial) -> dict[str, Any]:
+        """Return the options of a preset that holds the budget and does better, or nothing."""
+        wanted = self._budget.min_psnr
+        if wanted is None or best.level < wanted + _LOOSE:
+            return {}
+        chosen: dict[str, Any] = {}
+        for changes in self._whole.record.presets.values():
+            options = {name: value for name, value in changes.items() if name not in self._whole.fixed}
+            try:
+                trial = self._whole.encode(options)
+            except GsplatError:
+                continue
+            if self._holds(trial) and self._is_better(trial, best):
+                chosen, best = options, trial
+        return chosen
 
     def _propose(self, margin: float) -> Choice | None:
         """Return the best choice by the corrected prediction, a little better than the budget asks for."""

@@ -1,0 +1,178 @@
+"""Spend only what a scene requires: options that are chosen by measurement, each with its evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsplat_tools.chunks import CloudChunks
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.errors import GsplatError, ValidationError
+from gsplat_tools.formats.base import Format, Scene
+from gsplat_tools.formats.loading import drop_or_refuse
+from gsplat_tools.sequence import GaussianSequence
+from gsplat_tools.tuning.measuring import Model, Workbench
+from gsplat_tools.tuning.search import TARGET_SIZE, TARGET_VIEWS, Budget, Found, Searcher
+from gsplat_tools.tuning.trials import Trial
+
+VISIBLE_PSNR = 20 * float(np.log10(255))
+"""48.13 dB: the root mean square error of a picture is one step of 8 bits, below which a screen shows next to nothing."""
+
+Decision = dict[str, Any]
+"""What was decided: "option", "value", "bytes_saved", "db_lost" (None where nothing was measured) and "why"."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Tuned:
+    """A scene and the options to write it with.
+
+    Parameters
+    ----------
+    scene
+        What to write; less than was given where nothing is lost by that.
+    options
+        Above those that were asked for.
+    decisions
+        What was decided, with its evidence.
+    found
+        Of the search; None where the preset stays.
+    bench
+        The source, for the pictures that the target is judged by.
+    """
+
+    scene: GaussianCloud | GaussianSequence
+    options: dict[str, Any] = field(default_factory=dict)
+    decisions: list[Decision] = field(default_factory=list)
+    found: Found | None = None
+    bench: Workbench
+
+
+def tune(
+    scene: Scene,
+    record: Format,
+    *,
+    preset: str,
+    options: Mapping[str, Any],
+    budget: Budget | None = None,
+    views: int = TARGET_VIEWS,
+    size: tuple[int, int] = TARGET_SIZE,
+    model: Model | None = None,
+) -> Tuned:
+    """Choose the options of a conversion by measurement.
+
+    Parameters
+    ----------
+    scene
+        What is to be written; invalid splats are left out of what is measured.
+    record
+        Format to write.
+    preset, options
+        What was asked for; options stay as they are.
+    budget
+        What to hold. By default the worst view of the preset, or `VISIBLE_PSNR` where that is less, at fewer bytes.
+    views, size, model
+        Views that decide, their size in px, and the rendering model.
+
+    Raises
+    ------
+    ValidationError
+        Nothing holds the budget, or the views show nothing.
+    GsplatError
+        The format cannot hold the scene.
+    """
+    whole = scene.read() if isinstance(scene, CloudChunks) else scene
+    decisions: list[Decision] = []
+    if budget is None:
+        whole, decisions = without_what_never_changes(whole)
+    valid = whole if isinstance(whole, GaussianSequence) else drop_or_refuse(whole, strict=bool(options.get("strict")))
+    searcher = Searcher(valid, record, preset=preset, pinned=options, views=views, size=size, model=model)
+    tuned = Tuned(scene=whole, decisions=decisions, bench=searcher.whole.bench)
+    if not searcher.whole.bench.shows_anything(searcher.whole.bench.model_of(record)):
+        raise ValidationError("the views show nothing of the scene, so that no choice can be judged by them")
+    if budget is not None:
+        tuned.found = searcher.find(budget)
+        tuned.options = dict(tuned.found.options)
+        tuned.decisions += [_of_search(each) for each in tuned.found.decisions]
+        return tuned
+    usual = searcher.whole.encode({})
+    found = searcher.find(Budget(min_psnr=min(usual.level, VISIBLE_PSNR)))
+    if found.bytes < usual.bytes:
+        tuned.found, tuned.options = found, dict(found.options)
+        tuned.decisions += _against_preset(searcher, usual, found)
+    return tuned
+
+
+def _of_search(decision: Mapping[str, Any]) -> Decision:
+    """Return a stream's part of a search as a decision."""
+    why = "the cheapest that holds the budget"
+    if decision["next_bytes"] is not None and decision["next_db"] is not None:
+        why += f"; one step finer costs {decision['next_bytes']:,} bytes and brings {decision['next_db']:.2f} dB"
+    return {
+        "option": " ".join(decision["options"]),
+        "value": " ".join(map(_short, decision["options"].values())),
+        "bytes_saved": None,
+        "db_lost": None,
+        "why": why,
+    }
+
+
+def _against_preset(searcher: Searcher, usual: Trial, found: Found) -> list[Decision]:
+    """Return every stream's choice by itself on top of the preset, measured."""
+    decisions = []
+    for each in found.decisions:
+        try:
+            trial = searcher.whole.encode(each["options"])
+        except GsplatError:
+            continue  # only together with the others
+        if trial.bytes == usual.bytes and trial.level == usual.level:
+            continue
+        lost = usual.level - trial.level
+        decisions.append({
+            "option": " ".join(each["options"]),
+            "value": " ".join(map(_short, each["options"].values())),
+            "bytes_saved": usual.bytes - trial.bytes,
+            "db_lost": round(lost, 3) if np.isfinite(lost) else None,
+            "why": "measured by itself on top of the preset; errors below what shows are not paid for",
+        })  # fmt: skip
+    return decisions
+
+
+def _short(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def without_what_never_changes(
+    scene: GaussianCloud | GaussianSequence,
+) -> tuple[GaussianCloud | GaussianSequence, list[Decision]]:
+    """Return a scene without motion that moves nothing, or one frame of a sequence whose frames are all the same."""
+    if isinstance(scene, GaussianSequence):
+        first = scene.frame(0)
+        if len(scene) == 1 or not all(_is_same(first, scene.frame(frame_id)) for frame_id in range(1, len(scene))):
+            return scene, []
+        still = GaussianSequence(lambda _frame: first, num_splats=scene.num_splats, sh_degree=scene.sh_degree, num_frames=1)
+        why = f"all {len(scene)} frames are the same"
+        return still, [{"option": "frames", "value": 1, "bytes_saved": None, "db_lost": 0.0, "why": why}]
+    if not scene.has_motion or scene.velocities is None or scene.times is None or scene.durations is None:
+        return scene, []
+    always = scene.time_model == "window" and bool(((scene.times <= 0) & (scene.times + scene.durations >= 1)).all())
+    if not always or scene.velocities.any():
+        return scene, []
+    size = scene.velocities.nbytes + scene.times.nbytes + scene.durations.nbytes
+    why = f"nothing moves, and all splats are there all the time: {size:,} bytes before compression"
+    still_cloud = scene.replace(velocities=None, times=None, durations=None)
+    return still_cloud, [{"option": "motion", "value": "none", "bytes_saved": None, "db_lost": 0.0, "why": why}]
+
+
+def _is_same(one: GaussianCloud, other: GaussianCloud) -> bool:
+    """Whether two frames hold the same bits."""
+    mine, theirs = one.arrays(), other.arrays()
+    return mine.keys() == theirs.keys() and all(np.array_equal(values, theirs[name]) for name, values in mine.items())
+
+
+def zero_bands(before: int, after: int) -> Decision:
+    """Return the decision to leave out bands that are zero everywhere."""
+    why = f"bands {after + 1} to {before} are zero everywhere"
+    return {"option": "sh_degree", "value": after, "bytes_saved": None, "db_lost": 0.0, "why": why}
