@@ -352,3 +352,12 @@ def test_invalid_splats__are_located_where_they_are() -> None:
     means[2, 1], means[7, 0], quats[5] = np.nan, np.nan, -0.0
 
     assert locate_invalid(cloud.replace(means=means, quats=quats)) == {"means-nan": (2, 2), "quats-zero": (1, 5)}
+
+
+def test_spark__counts_colors_that_are_not_numbers() -> None:
+    # They were clamped to black or white before the check for invalid splats, and drawn.
+    cloud = splats([[0, 0, 3.0]] * 3).replace(sh0=np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, 0]]))
+
+    counts = render(cloud, camera(), model="spark").counts
+
+    assert (counts.invalid, counts.drawn) == (2, 1)

@@ -68,8 +68,10 @@ def requantize(splats, eye, form):
         if form == PACKED:
             for c in range(3):
                 splats[row, R.MEAN + c] = f(round_to_half(splats[row, R.MEAN + c] - eye[c]))
-                color = min(max(splats[row, R.COLOR + c], zero), one)
-                splats[row, R.COLOR + c] = np.floor(color * bytes_ + half) / bytes_
+                color = splats[row, R.COLOR + c]
+                # Clamping would make a color of what is none; projection counts it as invalid.
+                if color * zero == zero:
+                    splats[row, R.COLOR + c] = np.floor(min(max(color, zero), one) * bytes_ + half) / bytes_
                 scale = splats[row, R.SCALE + c]
                 if scale > zero and scale < f(np.inf):
                     code = np.floor((math.log(np.float64(scale)) - _LN_MIN) * (_LN_STEPS / _LN_RANGE) + 0.5)
