@@ -32,7 +32,7 @@ MAX_PIXELS = 10.0
 # How much a change shows beyond the energy of its own trace, against a shift. Splats lie over each other, and neighbors are
 # changed alike where codes move to common ones: such errors add up instead of averaging out (docs/visual-tolerance.md).
 _COLOR_FACTOR = 16.0
-_SCALE_FACTOR = 4.0
+_SCALE_FACTOR = 8.0
 
 # Of float32 and of float64 differences of large numbers.
 _ROUNDING = 1e-5

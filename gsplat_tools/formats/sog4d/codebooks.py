@@ -217,7 +217,7 @@ def turned(cloud: GaussianCloud, frames: NDArray[np.uint8] | None) -> tuple[Floa
 
 
 def _balanced_scale_size(codebook: Float32, cloud: GaussianCloud, log_scales: Float32, tolerance: Tolerance) -> int:
-    """Return the size at which one more entry saves in what shows what it costs in bits.
+    """Return the size, at least the given, at which one more entry saves in what shows what it costs in bits.
 
     Between them, N splats pay log2 K bits each for their label and the text of K entries; what shows falls as 1 / K.
     """
@@ -230,7 +230,7 @@ def _balanced_scale_size(codebook: Float32, cloud: GaussianCloud, log_scales: Fl
     # The root of a K^2 + b K = shown x size: the derivatives balance.
     a, b = _ENTRY_BITS, len(cloud) / np.log(2)
     size = (np.sqrt(b * b + 4 * a * shown * len(codebook)) - b) / (2 * a)
-    return int(np.clip(size, len(codebook) / 4, min(4 * len(codebook), MAX_CODEBOOK)).clip(1))
+    return int(np.clip(size, len(codebook), max(len(codebook), min(4 * len(codebook), MAX_CODEBOOK))))
 
 
 def _fit_scales(log_scales: Float32, weights: Float32, size: int) -> tuple[Float32, float]:
