@@ -263,7 +263,7 @@ def test_render__evaluates_motion_as_the_sort_does() -> None:
 
     rendering = render(cloud, view(), model="unity", variant="fork-4d", t=0.3)
     visible = (cloud.times <= np.float32(0.3)) & (np.float32(0.3) <= cloud.times + cloud.durations)
-    moved = cloud.means + cloud.velocities * (np.float32(0.3) - cloud.times)[:, None]
+    moved = cloud.means + cloud.velocities * (0.3 - cloud.times.astype(np.float64))[:, None]
     frozen = cloud.replace(means=moved, velocities=None, times=None, durations=None).take(visible)
 
     assert rendering.counts.hidden == np.count_nonzero(~visible)
