@@ -81,7 +81,7 @@ def validate(path: str | Path, *, max_issues: int = 100) -> dict[str, Any]:
         stream, record = open_source(path)
     rules = rules_of(record)
     gathered: dict[str, dict[str, Any]] = {}
-    with stream, stage("validating", unit="findings") as progress:
+    with located(path), stream, stage("validating", unit="findings") as progress:
         for issue in _issues(stream, record):
             progress.advance(1)
             entry = gathered.setdefault(

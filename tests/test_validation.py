@@ -71,3 +71,19 @@ def test_normalize__has_nothing_to_do_for_a_ply(tmp_path: Path) -> None:
         normalize(tmp_path / "a.ply")
 
     assert (tmp_path / "a.ply").read_bytes() == before
+
+
+def test_validate__names_the_file_in_every_error(tmp_path: Path) -> None:
+    from tests.formats.sog_files import edited, version_2
+
+    for folder, model in (("a", "default"), ("b", "antialiased")):
+        (tmp_path / folder).mkdir()
+        for name, data in edited(version_2(0), "model", model).items():
+            (tmp_path / folder / name).write_bytes(data)
+    leaves = [{"lods": {"0": {"file": file, "offset": 0, "count": 5}}} for file in (0, 1)]
+    scene = {"lodLevels": 1, "filenames": ["a/meta.json", "b/meta.json"], "tree": {"children": leaves}}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(scene))
+
+    with pytest.raises(CapabilityError, match="several splat models") as caught:
+        validate(tmp_path / "lod-meta.json")
+    assert caught.value.path == tmp_path / "lod-meta.json"

@@ -66,6 +66,7 @@ def judge(record: Format, path: Path, *, thorough: bool = False, seconds: float 
         _watched("check", lambda: _check(record, path), declared, flaws, limit)
     if thorough:
         _watched("load", lambda: load(path), declared, flaws, limit)
+        _watched("stream", lambda: _read_stream(record, path), declared, flaws, limit)
         _watched("validate", lambda: json.dumps(finite(validate(path)), allow_nan=False), declared, flaws, limit)
         if record.repair is not None:
             _watched("repair", lambda: _repair(record, path), declared, flaws, limit)
@@ -183,6 +184,13 @@ def _read(record: Format, path: Path, *, in_chunks: bool) -> None:
         elif isinstance(scene, GaussianSequence):
             for frame in range(min(len(scene), 3)):
                 scene.frame(frame)
+
+
+def _read_stream(record: Format, path: Path) -> None:
+    """Read from memory, where nothing lies beside the file."""
+    assert record.read is not None
+    with located(path):
+        record.read(io.BytesIO(path.read_bytes()), record.read_options())
 
 
 def _check(record: Format, path: Path) -> None:
