@@ -33,6 +33,7 @@ MAX_PIXELS = 10.0
 # changed alike where codes move to common ones: such errors add up instead of averaging out (docs/visual-tolerance.md).
 _COLOR_FACTOR = 16.0
 _SCALE_FACTOR = 8.0
+_TURN_FACTOR = 3.0
 
 # Of float32 and of float64 differences of large numbers.
 _ROUNDING = 1e-5
@@ -199,7 +200,7 @@ def visible_costs(cloud: GaussianCloud, log_scales: NDArray[np.float32], pixels:
     color = _COLOR_FACTOR * power * area
     costs = {
         "position": power * shift,
-        "rotation": power[:, None] * np.stack(turns, axis=1),
+        "rotation": _TURN_FACTOR * power[:, None] * np.stack(turns, axis=1),
         "scale": _SCALE_FACTOR * power * area * (3 / 8),
         "opacity": area / bit,
         "color": color * SH_C0**2,
