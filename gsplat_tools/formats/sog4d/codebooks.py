@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -94,22 +94,41 @@ class Sample:
     sh0_range: tuple[float, float]
 
 
-def draw_sample(frames: Iterable[GaussianCloud], num_frames: int, seed: int) -> Sample:
-    """Go through all frames once and keep the same number of splats of each."""
+@dataclass(frozen=True, slots=True)
+class FrameSample:
+    """Splats drawn from one frame, and the range of all its colors."""
+
+    log_scales: Float32
+    sh0: Float32
+    shN: Float32
+    weights: Float32
+    sh0_range: tuple[float, float]
+
+
+def draw_frame(cloud: GaussianCloud, frame_id: int, num_frames: int, seed: int) -> FrameSample:
+    """Draw the splats of one frame: the same for the same frame, whatever was drawn elsewhere before."""
     from gsplat_tools.ops.importance import importance
 
     quota = max(1, SAMPLE_ROWS // num_frames)
-    parts: list[tuple[Float32, ...]] = []
-    low, high = np.inf, -np.inf
-    for frame_id, cloud in enumerate(frames):
-        weights = importance(cloud)
-        rows: slice | NDArray[np.int64] = slice(None)
-        if len(cloud) > quota:
-            rows = np.sort(np.random.default_rng((seed, frame_id)).permutation(len(cloud))[:quota])
-        parts.append((cloud.log_scales[rows], cloud.sh0[rows], cloud.shN[rows], weights[rows]))
-        low, high = min(low, float(cloud.sh0.min())), max(high, float(cloud.sh0.max()))
-    log_scales, sh0, shN, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return Sample(log_scales, sh0, shN, weights, (low, high))
+    weights = importance(cloud)
+    rows: slice | NDArray[np.int64] = slice(None)
+    if len(cloud) > quota:
+        rows = np.sort(np.random.default_rng((seed, frame_id)).permutation(len(cloud))[:quota])
+    ends = float(cloud.sh0.min()), float(cloud.sh0.max())
+    return FrameSample(cloud.log_scales[rows], cloud.sh0[rows], cloud.shN[rows], weights[rows], ends)
+
+
+def merge_samples(parts: Sequence[FrameSample]) -> Sample:
+    """Return the samples of all frames as one; they must come in the order of the frames."""
+    names = ("log_scales", "sh0", "shN", "weights")
+    log_scales, sh0, shN, weights = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    lows, highs = zip(*(part.sh0_range for part in parts), strict=True)
+    return Sample(log_scales, sh0, shN, weights, (min(lows), max(highs)))
+
+
+def draw_sample(frames: Iterable[GaussianCloud], num_frames: int, seed: int) -> Sample:
+    """Go through all frames once and keep the same number of splats of each."""
+    return merge_samples([draw_frame(cloud, frame_id, num_frames, seed) for frame_id, cloud in enumerate(frames)])
 
 
 def scale_coordinates(log_scales: Float32) -> Float32:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -12,31 +13,28 @@ from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
-from gsplat_tools.formats import _webp
 from gsplat_tools.formats._webp import MAX_SIDE, Image
-from gsplat_tools.formats._zip import Compression, ZipWriter
-from gsplat_tools.formats.sog4d import labels as label_files
-from gsplat_tools.formats.sog4d.codebooks import (
-    Palette,
-    Shared,
-    check_finite,
-    draw_sample,
-    fit_shared,
-)
+from gsplat_tools.formats._zip import ZipWriter
+from gsplat_tools.formats.sog4d.codebooks import Palette, Shared, check_finite, draw_sample, fit_shared
 from gsplat_tools.formats.sog4d.decode import GENERATOR
-from gsplat_tools.formats.sog4d.frame import Previous, encode_frame
-from gsplat_tools.formats.sog4d.labels import Labels
 from gsplat_tools.formats.sog4d.meta import FRAME_TOKEN, Meta, PaletteMeta, Segment, frame_path, meta_text
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
+from gsplat_tools.formats.sog4d.segments import (
+    PATHS,
+    SegmentFacts,
+    choose_segments,
+    compress_image,
+    data_compression,
+    delta_path,
+    has_deltas,
+    image_compression,
+    segment_images,
+)
 from gsplat_tools.parallel import map_ordered
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
 
 Float32 = NDArray[np.float32]
-
-PATHS = {
-    name: f"frames/{FRAME_TOKEN}/{name}.webp" for name in ("position_hi", "position_lo", "scale_indices", "rotation", "sh0")
-}
 
 
 def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: Sog4dOptions) -> None:
@@ -49,67 +47,83 @@ def write(scene: GaussianCloud | GaussianSequence, stream: BinaryIO, options: So
     CloudError
         Values are not finite, or a frame differs from the first in count or degree.
     """
-    frames = _Frames(scene)
-    width, height = _choose_layout(frames.num_splats, options)
-    times = _choose_times(scene, len(frames), options)
+    frames = Frames(scene)
+    layout = choose_layout(frames.num_splats, options)
+    times = choose_times(scene, len(frames), options)
     with stage("fitting codebooks", len(frames), "frames") as progress:
         sample = draw_sample((frames[i] for i in _counted(len(frames), progress)), len(frames), options.seed)
-        shared = fit_shared(sample, frames[0], options, (width, height))
+        shared = fit_shared(sample, frames[0], options, layout)
     del sample
-    uses_deltas = options.labels == "delta-v1" or (options.labels == "auto" and len(frames) > 1)
-    segments = _segments(len(frames), options.delta_segment_length)
+    segments = choose_segments(len(frames), options.delta_segment_length)
+    uses_deltas = has_deltas(len(frames), options)
     archive = ZipWriter(stream)
-    deltas = _DeltaFiles(shared, segments) if uses_deltas else None
-    ranges: list[tuple[Float32, Float32]] = []
-    sources: set[str] = set()
-    clipped: dict[str, int] = {}
+    facts: list[SegmentFacts] = []
 
     def images() -> Iterator[tuple[str, Image]]:
-        previous: Previous | None = None
-        starts = {start for start, _ in segments}
-        for frame_id in range(len(frames)):
-            cloud = frames[frame_id]
-            planes = encode_frame(cloud, shared, None if frame_id in starts else previous)
-            ranges.append((planes.range_min, planes.range_max))
-            sources.add(cloud.source_format)
-            for name, number in planes.clipped.items():
-                clipped[name] = clipped.get(name, 0) + number
-            if deltas is not None:
-                deltas.add(frame_id, planes.labels)
-            for name in sorted(planes.images):
-                if name in PATHS or deltas is None or frame_id in starts:
-                    yield f"frames/{frame_id:05d}/{name}.webp", planes.images[name]
-            previous = Previous(cloud, planes.labels)
+        for segment in segments:
+            gathered = SegmentFacts()
+            yield from segment_images(frames.__getitem__, segment, shared, gathered, uses_deltas=uses_deltas)
+            facts.append(gathered)
 
-    def compress(item: tuple[str, Image]) -> tuple[str, bytes]:
-        name, image = item
-        return name, _webp.encode_rgba(image, options.webp_effort)
-
-    image_compression: Compression = "deflated" if options.zip == "deflated" else "stored"
-    data_compression: Compression = "stored" if options.zip == "stored" else "deflated"
     with stage("encoding", len(frames), "frames") as progress:
-        for name, data in map_ordered(compress, images()):
-            archive.add(name, data, image_compression)
+        for name, data in map_ordered(partial(compress_image, effort=options.webp_effort), images()):
+            archive.add(name, data, image_compression(options))
             if name.endswith("/sh0.webp"):
                 progress.advance(1)
-    meta = _meta(shared, frames.num_splats, segments if uses_deltas else None, times, ranges)
-    lossy = " and ".join(sorted(sources - {""}))
-    meta = replace(meta, generator=f"{meta.generator} from {lossy}") if lossy else meta
-    entries = {
-        "meta.json": meta_text(meta),
-        **{_centroids_path(palette): _centroid_bytes(palette, options) for palette in shared.palettes},
-        **({} if deltas is None else deltas.files),
-    }
+    entries = last_entries(shared, frames.num_splats, segments, times, facts, uses_deltas=uses_deltas)
+    for each in facts:
+        entries |= each.deltas
     for name in sorted(entries):
-        archive.add(name, entries[name], data_compression)
+        archive.add(name, entries[name], data_compression(options))
     archive.close()
-    if clipped:
-        count = clipped["sh0"]
+    warn_clipped(facts)
+
+
+def last_entries(
+    shared: Shared,
+    num_splats: int,
+    segments: list[tuple[int, int]],
+    times: NDArray[np.float64] | None,
+    facts: Sequence[SegmentFacts],
+    *,
+    uses_deltas: bool,
+) -> dict[str, bytes]:
+    """Return meta.json and the palettes, by name: what stands behind all frames, beside the delta files.
+
+    Parameters
+    ----------
+    shared
+        What all frames share.
+    num_splats
+        Splats in a frame.
+    segments
+        (start, number of frames) of all.
+    times
+        Explicit times, or None.
+    facts
+        What encoding left of each segment, in their order.
+    uses_deltas
+        Whether labels are stored as changes.
+    """
+    ranges = [each for fact in facts for each in fact.ranges]
+    meta = _meta(shared, num_splats, segments if uses_deltas else None, times, ranges)
+    lossy = " and ".join(sorted({source for fact in facts for source in fact.sources} - {""}))
+    meta = replace(meta, generator=f"{meta.generator} from {lossy}") if lossy else meta
+    return {
+        "meta.json": meta_text(meta),
+        **{_centroids_path(palette): _centroid_bytes(palette, shared.options) for palette in shared.palettes},
+    }
+
+
+def warn_clipped(facts: Sequence[SegmentFacts]) -> None:
+    """Warn of colors that the sh0 codebook could not reach, in frames as a whole."""
+    count = sum(fact.clipped.get("sh0", 0) for fact in facts)
+    if count:
         message = f"colors of {count} splats lie outside the sh0 codebook and were clamped; use --sh0-codebook fit"
-        warnings.warn(LossyConversionWarning(message, code="clamped-sh0"), stacklevel=3)
+        warnings.warn(LossyConversionWarning(message, code="clamped-sh0"), stacklevel=4)
 
 
-class _Frames:
+class Frames:
     """Frames of a scene, each checked when it is loaded; the last one is kept."""
 
     def __init__(self, scene: GaussianCloud | GaussianSequence) -> None:
@@ -141,40 +155,13 @@ class _Frames:
         return cloud
 
 
-class _DeltaFiles:
-    """Changes of labels, gathered segment by segment."""
-
-    def __init__(self, shared: Shared, segments: list[tuple[int, int]]) -> None:
-        self._shared = shared
-        self._ends = {start + count - 1: start for start, count in segments}
-        self._starts = {start for start, _ in segments}
-        self._before: dict[str, Labels] = {}
-        self._blocks: dict[str, list[NDArray[Any]]] = {}
-        self.files: dict[str, bytes] = {}
-
-    def add(self, frame: int, labels: dict[str, Labels]) -> None:
-        """Take the labels of the next frame."""
-        for palette in self._shared.palettes:
-            current = labels[palette.name]
-            if frame in self._starts:
-                self._blocks[palette.name] = []
-            else:
-                self._blocks[palette.name].append(label_files.changes(self._before[palette.name], current))
-            self._before[palette.name] = current
-            if frame in self._ends:
-                start = self._ends[frame]
-                self.files[_delta_path(palette.name, start)] = label_files.write_delta(
-                    (start, frame + 1 - start), len(current), len(palette.centroids), self._blocks[palette.name]
-                )
-
-
 def _counted(count: int, progress: Any) -> Iterator[int]:
     for i in range(count):
         yield i
         progress.advance(1)
 
 
-def _choose_layout(count: int, options: Sog4dOptions) -> tuple[int, int]:
+def choose_layout(count: int, options: Sog4dOptions) -> tuple[int, int]:
     """Return the layout that was asked for, completed, or a nearly square one."""
     from gsplat_tools.ops.ordering import image_layout
 
@@ -194,9 +181,7 @@ def _choose_layout(count: int, options: Sog4dOptions) -> tuple[int, int]:
     return width, height
 
 
-def _choose_times(
-    scene: GaussianCloud | GaussianSequence, num_frames: int, options: Sog4dOptions
-) -> NDArray[np.float64] | None:
+def choose_times(scene: GaussianCloud | GaussianSequence, num_frames: int, options: Sog4dOptions) -> NDArray[np.float64] | None:
     """Return explicit times, or None for the uniform mapping."""
     if options.time_mapping == "uniform":
         return None
@@ -217,17 +202,8 @@ def _choose_times(
     return times
 
 
-def _segments(num_frames: int, length: int) -> list[tuple[int, int]]:
-    """Return (start, count) of the segments."""
-    return [(start, min(length, num_frames - start)) for start in range(0, num_frames, length)]
-
-
 def _centroids_path(palette: Palette) -> str:
     return f"sh/{palette.name}_centroids.bin"
-
-
-def _delta_path(name: str, start: int) -> str:
-    return f"sh/{name}_delta_{start:05d}.bin"
 
 
 def _centroid_bytes(palette: Palette, options: Sog4dOptions) -> bytes:
@@ -256,7 +232,7 @@ def _meta(
                 centroids_path=_centroids_path(palette),
                 labels_path=template if segments is None else None,
                 segments=tuple(
-                    Segment(start, count, frame_path(template, start), _delta_path(palette.name, start))
+                    Segment(start, count, frame_path(template, start), delta_path(palette.name, start))
                     for start, count in segments or ()
                 ),
             )
