@@ -57,7 +57,9 @@ def test_costs__are_energies_of_differences_of_pictures(a: float, b: float, opac
     factors = {"position": 1, "opacity": 1, "scale": 8 / 2}  # two of three axes show
     for name, factor in factors.items():
         assert getattr(costs, name)[0] * small**2 == pytest.approx(factor * shown[name] / bit, rel=1e-3)
-    assert costs.rotation[0, 2] * small**2 == pytest.approx(3 * shown["turn"] / bit / 3, rel=1e-3, abs=1e-9)  # of three planes one
+    assert costs.rotation[0, 2] * small**2 == pytest.approx(
+        3 * shown["turn"] / bit / 3, rel=1e-3, abs=1e-9
+    )  # of three planes one
     assert costs.rotation[0, 0] < 1e-9  # b and b are alike
 
 
