@@ -14,11 +14,24 @@ ROOT = Path(__file__).parents[2]
 FORMATS = ROOT / "gsplat_tools" / "formats"
 
 WRITERS = (
-    *("_atomic", "_files", "_folder", "_relaxing", "base", "knobs", "loading", "preparing", "registry", "saving", "sequences"),
+    *(
+        "_atomic",
+        "_files",
+        "_folder",
+        "_relaxing",
+        "base",
+        "knobs",
+        "loading",
+        "preparing",
+        "preparing_frames",
+        "registry",
+        "saving",
+        "sequences",
+    ),
     *("compressed_ply/writing", "ply/writing", "splat4d/options", "splat4d/writing", "spz/limits"),
     *("pack/arrays", "pack/container_writing", "pack/encoding", "pack/limits", "pack/spark", "pack/uncompressed", "pack/words"),
     *(f"sog/{name}" for name in ("bounds", "codebooks", "encode", "folder", "options", "relaxing")),
-    *(f"sog4d/{name}" for name in ("bounds", "codebooks", "encode", "frame", "options", "relaxing", "repair")),
+    *(f"sog4d/{name}" for name in ("bounds", "codebooks", "encode", "frame", "options", "relaxing", "repair", "segments")),
 )
 """Modules that write, or that hold no parser; new ones count until they are named here."""
 
