@@ -18,6 +18,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison import AttributeTally, compare_rendered, paired, sample
 from gsplat_tools.comparison.rendered import MAX_RENDERED
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, ValidationError
+from gsplat_tools.formats._stores import local_path, url_of
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import drop_or_refuse, inspect_file, is_single, open_as, open_scene
 from gsplat_tools.formats.preparing import Prepared
@@ -81,7 +82,7 @@ class ConversionReport:
         return {
             "source": self.source,
             "source_format": self.source_format,
-            "target": {"path": str(self.path), "format": self.format, "bytes": self.bytes},
+            "target": {"path": url_of(self.path), "format": self.format, "bytes": self.bytes},
             "splats": self.splats,
             "sh_degree": self.sh_degree,
             "frames": self.frames,
@@ -159,6 +160,7 @@ def convert(
         The written file leaves its bounds, renders below `min_psnr`, or nothing holds the budget; the target is left as
         it was.
     """
+    sources, target = [local_path(each) for each in sources], local_path(target)
     record = find_target(Path(target), to)
     outcome: dict[str, Any] = {}
     seconds = {"read": 0.0, "encode": 0.0, "write": 0.0, "validate": 0.0}
@@ -204,7 +206,7 @@ def convert(
     if saved.sh_degree < source_degree and options.get("sh_degree") in (None, "auto") and record.max_sh_degree >= source_degree:
         decisions = [zero_bands(source_degree, saved.sh_degree), *decisions]
     return ConversionReport(
-        source=", ".join(map(str, sources)),
+        source=", ".join(map(url_of, sources)),
         source_format=source_format,
         path=saved.path,
         format=saved.format,

@@ -25,6 +25,7 @@ Messages say what was expected, what was found, and what to do; where it was is 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -68,12 +69,17 @@ class GsplatError(Exception):
 
     def __str__(self) -> str:
         place = [
-            *([str(self.path)] if self.path is not None else []),
+            *([_shown(self.path)] if self.path is not None else []),
             *([self.field] if self.field is not None else []),
             *([f"frame {self.frame}"] if self.frame is not None else []),
             *([f"byte {self.offset}"] if self.offset is not None else []),
         ]
         return f"{', '.join(place)}: {self.message}" if place else self.message
+
+
+def _shown(path: Path) -> str:
+    """Return a path as text; URLs get the slash back that paths lose."""
+    return re.sub(r"^([a-z][a-z0-9+.-]+):/(?=[^/])", r"\1://", str(path))
 
 
 class FormatError(GsplatError, ValueError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import warnings
 import weakref
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, UnknownFormatError, counts_in_words
 from gsplat_tools.formats._companion import attach, path_of, read_beside
 from gsplat_tools.formats._files import open_source_file
+from gsplat_tools.formats._stores import is_url
 from gsplat_tools.formats._stream import seekable
 from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format, Scene
 from gsplat_tools.formats.registry import FORMATS, detect, find_format
@@ -36,7 +38,9 @@ def located(path: Path) -> Iterator[None]:
 
 
 def is_single(path: Path) -> bool:
-    """Whether a path is one file or pipe, not a folder, a pattern or a device."""
+    """Whether a path is one file, pipe or object, not a folder, a pattern or a device."""
+    if is_url(path):
+        return not glob.has_magic(str(path))
     return path.is_file() or path.is_fifo()
 
 

@@ -80,7 +80,7 @@ class Prepared:
 
 
 @dataclass(slots=True)
-class _Scan:
+class Scan:
     """What one pass over a scene finds out."""
 
     num_splats: int = 0
@@ -100,6 +100,13 @@ class _Scan:
             self.high = np.maximum(self.high, cloud.means.max(axis=0))
             if self.sh_degree < cloud.sh_degree:
                 self.sh_degree = max(self.sh_degree, effective_sh_degree(cloud))
+
+    def merge(self, other: Scan) -> None:
+        """Take what another scan found into account."""
+        self.num_kept += other.num_kept
+        self.low = np.minimum(self.low, other.low)
+        self.high = np.maximum(self.high, other.high)
+        self.sh_degree = max(self.sh_degree, other.sh_degree)
 
 
 def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
@@ -133,7 +140,9 @@ def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
     """
     if isinstance(scene, GaussianSequence):
         if target.holds_sequences:
-            return _prepare_sequence(scene, target, choices)
+            from gsplat_tools.formats.preparing_frames import prepare_sequence  # which decides with what is here
+
+            return prepare_sequence(scene, target, choices)
         if len(scene) > 1:
             raise CapabilityError(
                 f"{target.title} holds one frame and the source has {len(scene)}; choose one with --frame or --time"
@@ -143,7 +152,7 @@ def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
     in_one = not target.streams or order != "none"
     chunks = as_chunks(scene, max(len(scene), 1)) if in_one else as_chunks(scene)
     scan = _scan(chunks, choices)
-    fit = _Fit(chunks.template, target, choices, scan)
+    fit = Fit(chunks.template, target, choices, scan)
     prepared = chunks.map(fit, num_splats=scan.num_kept)
     if not in_one:
         return Prepared(prepared, dict(scan.dropped))
@@ -155,67 +164,9 @@ def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
     return Prepared(cloud, dict(scan.dropped))
 
 
-def _prepare_sequence(sequence: GaussianSequence, target: Format, choices: SaveChoices) -> Prepared:
-    """Fit every frame alike: a splat that goes in one frame goes in all, and the first frame gives the order."""
-    from gsplat_tools.ops.filtering import classify_invalid
-
-    first = sequence.frame(0)
-    keeps = np.ones(sequence.num_splats, np.bool_)
-    visible = np.full(sequence.num_splats, choices.prune_opacity == 0)
-    causes: Counter[str] = Counter()
-    scan = _Scan(num_splats=sequence.num_splats)
-    with stage("checking frames", len(sequence), "frames") as progress:
-        for frame_id in range(len(sequence)):
-            frame = first if frame_id == 0 else sequence.frame(frame_id)
-            is_valid, dropped = classify_invalid(frame)
-            if dropped and choices.strict:
-                raise CloudError(f"invalid splats: {counts_in_words(dropped)}", frame=frame_id)
-            if dropped:
-                newly = classify_invalid(frame.take(keeps))[1]
-                causes.update(newly)
-            keeps &= is_valid
-            if choices.prune_opacity > 0:
-                visible |= _is_at_least(frame, choices.prune_opacity)
-            scan.add(frame)
-            progress.advance(1)
-    warn_dropped(dict(causes), sequence.num_splats)
-    pruned = int(np.count_nonzero(keeps & ~visible))
-    if pruned:
-        causes["pruned-opacity"] = pruned
-    keeps &= visible
-    if not keeps.all():  # what was found holds for all splats; look again at those that stay
-        scan = _Scan(num_splats=sequence.num_splats)
-        for frame_id in range(len(sequence)):
-            scan.add((sequence.frame(frame_id) if frame_id else first).take(keeps))
-    scan.dropped = causes
-    fit = _Fit(first.take(slice(0, 0)), target, choices, scan)
-    fitted = fit.apply(first.take(keeps))
-    order = choices.order or target.order
-    selection = np.flatnonzero(keeps)
-    if order != "none":
-        from gsplat_tools.ops.ordering import splat_order
-
-        selection = selection[splat_order(fitted, order)]
-    mapped = GaussianSequence(
-        lambda frame_id: fit.apply(sequence.frame(frame_id).take(selection)),
-        num_splats=len(selection),
-        sh_degree=fitted.sh_degree,
-        frame_times=None if sequence.is_uniform else sequence.frame_times,
-        num_frames=len(sequence),
-    )
-    return Prepared(mapped, dict(causes))
-
-
-def _is_at_least(cloud: GaussianCloud, opacity: float) -> NDArray[np.bool_]:
-    """Whether each splat is at least this opaque."""
-    from gsplat_tools.attributes.activations import sigmoid
-
-    return sigmoid(cloud.opacity_logits) >= opacity
-
-
-def _scan(chunks: CloudChunks, choices: SaveChoices) -> _Scan:
+def _scan(chunks: CloudChunks, choices: SaveChoices) -> Scan:
     """Go through the scene once: invalid splats, bounds, highest band in use."""
-    scan = _Scan()
+    scan = Scan()
     with stage("reading", len(chunks)) as progress:
         for chunk in chunks:
             scan.num_splats += len(chunk)
@@ -244,10 +195,10 @@ def _clean(chunk: GaussianCloud, choices: SaveChoices, dropped: Counter[str] | N
     return kept
 
 
-class _Fit:
+class Fit:
     """The decisions about one scene, applied to any piece of it."""
 
-    def __init__(self, template: GaussianCloud, target: Format, choices: SaveChoices, scan: _Scan) -> None:
+    def __init__(self, template: GaussianCloud, target: Format, choices: SaveChoices, scan: Scan) -> None:
         self._target = target
         self._choices = choices
         self._drops_anything = bool(scan.dropped)
@@ -278,6 +229,7 @@ class _Fit:
             self._choose_origin(turned, scan)
 
     def __call__(self, chunk: GaussianCloud) -> GaussianCloud:
+        """Clean a chunk as it was found and apply the decisions to it."""
         return self.apply(_clean(chunk, self._choices) if self._drops_anything else chunk)
 
     def apply(self, chunk: GaussianCloud) -> GaussianCloud:
@@ -339,7 +291,7 @@ class _Fit:
             )
         return source, required
 
-    def _choose_degree(self, template: GaussianCloud, scan: _Scan) -> int:
+    def _choose_degree(self, template: GaussianCloud, scan: Scan) -> int:
         """Return the highest band to write."""
         wanted = self._choices.sh_degree
         if wanted is None:
@@ -360,7 +312,7 @@ class _Fit:
             degree = self._target.max_sh_degree
         return degree
 
-    def _choose_origin(self, corners: GaussianCloud, scan: _Scan) -> None:
+    def _choose_origin(self, corners: GaussianCloud, scan: Scan) -> None:
         """Decide what happens to the origin, from the two corners of the box in the target's axes."""
         from gsplat_tools.ops.recentering import choose_origin, position_step
 

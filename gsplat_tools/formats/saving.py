@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 import time
 import warnings
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.errors import CapabilityError, FormatError, GsplatWarning, TargetExistsError, WriteError
-from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.formats._atomic import read_back, replacing, temporary_beside
 from gsplat_tools.formats._companion import path_of, write_beside
 from gsplat_tools.formats._folder import folder_size, replacing_folder
+from gsplat_tools.formats._stores import exists, is_url, local_path, replacing_object
 from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import located
@@ -23,6 +26,7 @@ from gsplat_tools.formats.registry import FORMATS, find_format, format_of_extens
 from gsplat_tools.sequence import GaussianSequence
 
 DEFAULT_PRESET = "balanced"
+COPY_BYTES = 1 << 20
 
 Check = Callable[[BinaryIO, Prepared, Format], None]
 """Looks at the finished temporary file before it replaces the target; raises to keep the target as it was."""
@@ -82,10 +86,27 @@ def _format_of_index(path: Path) -> Format | None:
 
 
 def _replacing(path: Path, record: Format, *, overwrite: bool) -> AbstractContextManager[BinaryIO]:
-    """Open what takes the place of a target: one file, or the files of a folder."""
+    """Open what takes the place of a target: one file, the files of a folder, or an object of a store."""
+    if is_url(path):
+        return _replacing_object(path, record, overwrite=overwrite)
     if record.folder is not None and path.name == record.folder.index:
         return replacing_folder(path, record.folder, overwrite=overwrite)
     return replacing(path, overwrite=overwrite)
+
+
+@contextmanager
+def _replacing_object(path: Path, record: Format, *, overwrite: bool) -> Iterator[BinaryIO]:
+    """Write to a temporary file, which writers go back in, and send it when it is finished."""
+    if record.claims is not None or (record.folder is not None and path.name == record.folder.index):
+        raise CapabilityError(f"{record.title} is more than one file; write it to a disk and copy them", path=path)
+    if not overwrite and exists(path):
+        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=path)
+    with tempfile.TemporaryDirectory(prefix="gsplat-") as folder, temporary_beside(Path(folder) / path.name) as stream:
+        yield stream
+        read_back(stream, path)
+        with replacing_object(path, overwrite=overwrite) as target:
+            stream.seek(0)
+            shutil.copyfileobj(stream, target, COPY_BYTES)
 
 
 def count_splats(scene: Scene) -> int:
@@ -189,7 +210,7 @@ def save(
     LossyConversionWarning, NonFiniteWarning
         What the target cannot hold, with counts.
     """
-    path = Path(path)
+    path = Path(local_path(path))
     record = find_target(path, to)
     choices, write_options = split_options(record, preset, options)
     assert record.write is not None

@@ -12,7 +12,8 @@ import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, UnknownFormatError
-from gsplat_tools.formats.base import FileInfo
+from gsplat_tools.formats._stores import is_url, local_path, matching
+from gsplat_tools.formats.base import FileInfo, Format
 from gsplat_tools.formats.loading import inspect_file, located, open_scene
 from gsplat_tools.formats.registry import format_of_extension
 from gsplat_tools.sequence import GaussianSequence
@@ -52,14 +53,12 @@ def open_sequence(paths: str | Path | Iterable[str | Path], *, frame_times: Sequ
         return _single_bundle(files[0], frame_times)
     for frame_id, path in enumerate(files):
         record, info = (first_record, first) if frame_id == 0 else inspect_file(path)
-        if record.holds_sequences and info.frames > 1:
-            raise CapabilityError(f"a frame cannot be a sequence of {info.frames} frames itself", path=path, frame=frame_id)
-        _check_alike(first, info, files[0], path, frame_id)
+        check_frame(first, record, info, files[0], path, frame_id)
     times = None if frame_times is None else np.asarray(frame_times, np.float64)
     if times is not None and times.shape != (len(files),):
         raise CapabilityError(f"frame_times needs one time a frame, {len(files)}, and has {times.size}")
     return GaussianSequence(
-        lambda frame_id: _load_frame(files[frame_id], frame_id, first),
+        lambda frame_id: load_frame(files[frame_id], frame_id, first),
         num_splats=first.splats,
         sh_degree=first.sh_degree,
         frame_times=times,
@@ -82,8 +81,10 @@ def frame_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     """
     items = [paths] if isinstance(paths, str | Path) else list(paths)
     files: list[Path] = []
-    for item in map(Path, items):
-        if item.is_dir():
+    for item in map(Path, map(local_path, items)):
+        if is_url(item):
+            files += _objects(item)
+        elif item.is_dir():
             files += _files_of_folder(item)
         elif item.exists() or not glob.has_magic(str(item)):
             files.append(item)
@@ -95,6 +96,16 @@ def frame_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     if not files:
         raise CapabilityError("a sequence needs at least one frame")
     return files
+
+
+def _objects(item: Path) -> list[Path]:
+    """Return the objects that a URL or a pattern of one stands for."""
+    if not glob.has_magic(str(item)):
+        return [item]
+    found = [Path(url) for url in matching(item)]
+    if not found:
+        raise CapabilityError("no object matches the pattern", path=item)
+    return sorted(found, key=natural_key)
 
 
 def natural_key(path: Path) -> tuple[Any, ...]:
@@ -120,8 +131,16 @@ def _files_of_folder(folder: Path) -> list[Path]:
     return sorted(next(iter(by_format.values())), key=natural_key)
 
 
-def _check_alike(first: FileInfo, info: FileInfo, first_path: Path, path: Path, frame_id: int) -> None:
-    """Refuse a frame whose header differs from that of the first."""
+def check_frame(first: FileInfo, record: Format, info: FileInfo, first_path: Path, path: Path, frame_id: int) -> None:
+    """Refuse a frame that is a sequence itself, or whose header differs from that of the first.
+
+    Raises
+    ------
+    CapabilityError, CloudError
+        It is, or does.
+    """
+    if record.holds_sequences and info.frames > 1:
+        raise CapabilityError(f"a frame cannot be a sequence of {info.frames} frames itself", path=path, frame=frame_id)
     for name in _COMPARED:
         if getattr(info, name) != getattr(first, name):
             raise CloudError(
@@ -137,8 +156,21 @@ def _check_alike(first: FileInfo, info: FileInfo, first_path: Path, path: Path, 
         raise CloudError(f"every frame needs the properties of {first_path.name}; this one {what}", path=path, frame=frame_id)
 
 
-def _load_frame(path: Path, frame_id: int, first: FileInfo) -> GaussianCloud:
-    """Read one frame, as it is on the disk now."""
+def load_frame(path: Path, frame_id: int, first: FileInfo) -> GaussianCloud:
+    """Read one frame, as it is on the disk now.
+
+    Parameters
+    ----------
+    path, frame_id
+        The file, and the frame that errors name.
+    first
+        What the header of the first frame says; this one must have as many splats of the same degree.
+
+    Raises
+    ------
+    FormatError, CloudError
+        It cannot be read, or is unlike the first.
+    """
     with open_scene(path, in_chunks=False) as scene:
         cloud = scene.frame(0) if isinstance(scene, GaussianSequence) else scene
         if not isinstance(cloud, GaussianCloud):

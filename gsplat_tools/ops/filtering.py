@@ -46,16 +46,19 @@ def classify_invalid(cloud: GaussianCloud) -> tuple[NDArray[np.bool_], dict[str,
         keeps (N,) bool, true for valid splats · the number of invalid splats per cause, without zeros, in the order of
         CAUSES.
     """
-    codes = _codes(cloud)
-    if codes is None:
-        return np.ones(len(cloud), np.bool_), {}
+    codes = invalid_codes(cloud)
+    return (np.ones(len(cloud), np.bool_), {}) if codes is None else (codes == 0, count_causes(codes))
+
+
+def count_causes(codes: NDArray[np.uint8]) -> dict[str, int]:
+    """Return the number of splats per cause, without zeros, in the order of CAUSES."""
     counts = np.bincount(codes, minlength=len(CAUSES) + 1)[1:]
-    return codes == 0, {cause: int(count) for cause, count in zip(CAUSES, counts, strict=True) if count}
+    return {cause: int(count) for cause, count in zip(CAUSES, counts, strict=True) if count}
 
 
 def locate_invalid(cloud: GaussianCloud) -> dict[str, tuple[int, int]]:
     """Return (number of splats, index of the first) per cause, in the order of CAUSES; empty where all are valid."""
-    codes = _codes(cloud)
+    codes = invalid_codes(cloud)
     if codes is None:
         return {}
     found = {cause: codes == code for cause, code in _CODES.items()}
@@ -117,7 +120,7 @@ def prune_opacity(cloud: GaussianCloud, threshold: float) -> tuple[GaussianCloud
     return (cloud.take(~is_faint), count) if count else (cloud, 0)
 
 
-def _codes(cloud: GaussianCloud) -> NDArray[np.uint8] | None:
+def invalid_codes(cloud: GaussianCloud) -> NDArray[np.uint8] | None:
     """Return the code of each splat's first cause, 0 for valid ones; None where all are valid."""
     if len(cloud) == 0:
         return None

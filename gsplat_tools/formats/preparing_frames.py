@@ -1,0 +1,183 @@
+"""Fit the frames of a sequence to their target alike: what each frame has to tell, and what follows from all of them.
+
+Frames may be looked at anywhere and in any order; what is decided depends on their numbers alone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.errors import CloudError, counts_in_words
+from gsplat_tools.formats.base import Format
+from gsplat_tools.formats.loading import warn_dropped
+from gsplat_tools.formats.preparing import Fit, Prepared, SaveChoices, Scan
+from gsplat_tools.progress import stage
+from gsplat_tools.sequence import GaussianSequence
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFacts:
+    """What one frame tells about the splats that may stay.
+
+    Parameters
+    ----------
+    codes
+        (N,) the cause for which each splat is invalid, as `ops.filtering` numbers them; None where all are valid.
+    visible
+        (N,) whether each is opaque enough, as packed bits; None where nothing is pruned.
+    scan
+        Bounds and highest band.
+    """
+
+    codes: NDArray[np.uint8] | None
+    visible: NDArray[np.uint8] | None
+    scan: Scan
+
+
+def look_at_frame(frame: GaussianCloud, choices: SaveChoices, keeps: NDArray[np.bool_] | None = None) -> FrameFacts:
+    """Return what a frame tells; with `keeps`, the bounds of the splats that stay and nothing else."""
+    from gsplat_tools.ops.filtering import invalid_codes
+
+    scan = Scan()
+    if keeps is not None:
+        scan.add(frame.take(keeps))
+        return FrameFacts(None, None, scan)
+    scan.add(frame)
+    visible = np.packbits(_is_at_least(frame, choices.prune_opacity)) if choices.prune_opacity > 0 else None
+    return FrameFacts(invalid_codes(frame), visible, scan)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFit:
+    """What was decided for all frames.
+
+    Parameters
+    ----------
+    fit
+        Axes, origin and degree.
+    selection
+        (M,) splats that stay, in the order of the target.
+    sh_degree
+        Highest band of what is written.
+    """
+
+    fit: Fit
+    selection: NDArray[np.intp]
+    sh_degree: int
+
+    def __call__(self, frame: GaussianCloud) -> GaussianCloud:
+        """Return a frame as the target is to have it."""
+        return self.fit.apply(frame.take(self.selection))
+
+
+def fit_frames(
+    first: GaussianCloud,
+    facts: Iterable[FrameFacts],
+    look_again: Callable[[NDArray[np.bool_]], Iterable[FrameFacts]],
+    target: Format,
+    choices: SaveChoices,
+) -> tuple[FrameFit, dict[str, int]]:
+    """Decide how all frames are fitted: a splat that goes in one frame goes in all, and the first frame gives the order.
+
+    Parameters
+    ----------
+    first
+        The first frame.
+    facts
+        What every frame tells, in their order.
+    look_again
+        Called where splats go, with (N,) whether each stays; returns what every frame tells then.
+    target, choices
+        Format that will be written, and what was asked for.
+
+    Returns
+    -------
+    tuple
+        What was decided · splats left out, per cause.
+
+    Raises
+    ------
+    CapabilityError, CloudError
+        See `prepare`.
+    """
+    from gsplat_tools.ops.filtering import count_causes
+
+    count = len(first)
+    keeps = np.ones(count, np.bool_)
+    visible = np.packbits(np.full(count, choices.prune_opacity == 0))
+    causes: Counter[str] = Counter()
+    scan = Scan(num_splats=count)
+    for frame_id, each in enumerate(facts):
+        if each.codes is not None:
+            if choices.strict:
+                raise CloudError(f"invalid splats: {counts_in_words(count_causes(each.codes))}", frame=frame_id)
+            causes.update(count_causes(each.codes[keeps]))
+            keeps &= each.codes == 0
+        if each.visible is not None:
+            visible |= each.visible
+        scan.merge(each.scan)
+    warn_dropped(dict(causes), count)
+    is_visible = np.unpackbits(visible, count=count).astype(np.bool_)
+    pruned = int(np.count_nonzero(keeps & ~is_visible))
+    if pruned:
+        causes["pruned-opacity"] = pruned
+    keeps &= is_visible
+    if not keeps.all():  # what was found holds for all splats; look again at those that stay
+        scan = Scan(num_splats=count)
+        for each in look_again(keeps):
+            scan.merge(each.scan)
+    scan.dropped = causes
+    fit = Fit(first.take(slice(0, 0)), target, choices, scan)
+    fitted = fit.apply(first.take(keeps))
+    order = choices.order or target.order
+    selection = np.flatnonzero(keeps)
+    if order != "none":
+        from gsplat_tools.ops.ordering import splat_order
+
+        selection = selection[splat_order(fitted, order)]
+    return FrameFit(fit, selection, fitted.sh_degree), dict(causes)
+
+
+def prepare_sequence(sequence: GaussianSequence, target: Format, choices: SaveChoices) -> Prepared:
+    """Fit the frames of a sequence to their target; see `prepare`."""
+    first = sequence.frame(0)
+
+    def frames() -> Iterator[GaussianCloud]:
+        yield first
+        for frame_id in range(1, len(sequence)):
+            yield sequence.frame(frame_id)
+
+    def facts() -> Iterator[FrameFacts]:
+        with stage("checking frames", len(sequence), "frames") as progress:
+            for frame in frames():
+                yield look_at_frame(frame, choices)
+                progress.advance(1)
+
+    fit, dropped = fit_frames(
+        first, facts(), lambda keeps: (look_at_frame(frame, choices, keeps) for frame in frames()), target, choices
+    )
+    return Prepared(fitted_sequence(sequence, fit), dropped)
+
+
+def fitted_sequence(sequence: GaussianSequence, fit: FrameFit) -> GaussianSequence:
+    """Return the frames as they are to be written, fitted when they are loaded."""
+    return GaussianSequence(
+        lambda frame_id: fit(sequence.frame(frame_id)),
+        num_splats=len(fit.selection),
+        sh_degree=fit.sh_degree,
+        frame_times=None if sequence.is_uniform else sequence.frame_times,
+        num_frames=len(sequence),
+    )
+
+
+def _is_at_least(cloud: GaussianCloud, opacity: float) -> NDArray[np.bool_]:
+    """Whether each splat is at least this opaque."""
+    from gsplat_tools.attributes.activations import sigmoid
+
+    return sigmoid(cloud.opacity_logits) >= opacity
