@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsplat_tools.errors import CorruptDataError, FormatError, WriteError
-from gsplat_tools.formats._files import reason
 from gsplat_tools.formats import _json
+from gsplat_tools.formats._files import reason
 from gsplat_tools.formats._stream import stream_size
 
 SUFFIX = ".json"

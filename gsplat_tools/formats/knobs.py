@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from gsplat_tools.constants import MAX_SH_DEGREE
 
-Stream = Literal["splats", "positions", "scales", "rotations", "ranges", "colors", "sh", "labels", "container"]
+Stream = Literal["splats", "positions", "scales", "rotations", "ranges", "colors", "sh", "labels", "codes", "container"]
 
 ATTRIBUTES: Mapping[Stream, tuple[str, ...]] = {
     "splats": (),
@@ -19,10 +19,11 @@ ATTRIBUTES: Mapping[Stream, tuple[str, ...]] = {
     "colors": ("sh0",),
     "sh": ("shN",),
     "labels": ("log_scales", "quats", "shN"),
+    "codes": ("means", "log_scales", "quats", "sh0", "shN"),
     "container": (),
 }
 """Arrays of the cloud whose errors a stream decides. Scales and rotations go together, since encoders rename axes.
-"splats" decides which splats are there at all, "container" how bytes are packed, which changes no value."""
+"codes" moves codes of all of them to cheap neighbors; "splats" decides which splats are there at all, "container" how bytes are packed, which changes no value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +61,10 @@ skipped. Source: the rasterizer of Kerbl et al. 2023."""
 
 SIZES = tuple(round(2 ** (step / 2)) for step in range(10, 31))
 """Entries of codebooks and palettes, 32 to 32,768, each sqrt(2) times the one before."""
+
+
+TOLERANCES = (0.3, 0.2, 0.1, 0.05, 0.02, 0.0)
+"""Pixels of `visual_tolerance`."""
 
 
 def general_knobs(max_sh_degree: int = MAX_SH_DEGREE) -> dict[str, Knob]:

@@ -20,7 +20,7 @@ from gsplat_tools.tuning.trials import Errors, Trials, level
 
 _MAX_ELEMENTS = 1 << 23
 """Errors that are compared at once: combinations times pictures."""
-_FACTORS = ("splats", "container")
+_FACTORS = ("splats", "codes", "container")
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._webp import DEFAULT_EFFORT
-from gsplat_tools.formats.knobs import SIZES, Knob, general_knobs
+from gsplat_tools.formats.knobs import SIZES, TOLERANCES, Knob, general_knobs
 from gsplat_tools.formats.sog.rules import MAX_PALETTE
 from gsplat_tools.ops.visibility import MAX_PIXELS
 
@@ -77,6 +77,7 @@ KNOBS: dict[str, Knob] = {
     "sh_palette_size": Knob(values=SIZES, stream="sh", graded=True, needs={"sh_degree": (1, 2, 3)}),
     "visual_tolerance": Knob(values=TOLERANCES, stream="positions", graded=True),
     "rotation": Knob(values=("small", "best"), stream="rotations"),
+    "visual_tolerance": Knob(values=TOLERANCES, stream="codes"),
     "webp_effort": Knob(values=(1, 3, 9), stream="container"),
 }
 

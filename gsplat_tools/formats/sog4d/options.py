@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.formats._webp import DEFAULT_EFFORT, MAX_SIDE
-from gsplat_tools.formats.knobs import SIZES, Knob, general_knobs
+from gsplat_tools.formats.knobs import SIZES, TOLERANCES, Knob, general_knobs
 from gsplat_tools.formats.sog4d.rules import MAX_CODEBOOK, MAX_PALETTE
 from gsplat_tools.ops.visibility import MAX_PIXELS
 
@@ -157,6 +157,7 @@ KNOBS: dict[str, Knob] = {
         needs={"rotation": ("small",)},
     ),
     "keep_tolerance": Knob(values=(0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.0), stream="labels", sequences_only=True),
+    "visual_tolerance": Knob(values=TOLERANCES, stream="codes"),
     "webp_effort": Knob(values=(1, 3, 7), stream="container"),
 }
 

@@ -59,7 +59,7 @@ def _record(precision: Precision, title: str) -> Format:
         streams=True,
         position_type=precision,
         write_options=BufferOptions,
-        presets={"fast": {}, "balanced": {}, "best": {}},
+        presets={"fast": {}, "balanced": {}, "best": {}, "exact": {}},
         knobs=general_knobs(MAX_SH_DEGREE),
         model=("visionary", None),
     )
@@ -84,7 +84,7 @@ FORMATS = (
         order="morton",
         position_type="fixed",
         write_options=Int8Options,
-        presets={"fast": {"clip": 0.0}, "balanced": {}, "best": {}},
+        presets={"fast": {"clip": 0.0}, "balanced": {}, "best": {}, "exact": {}},
         knobs={**general_knobs(MAX_SH_DEGREE), "position_bits": Knob(values=(8, 16), stream="positions")},
         model=("visionary", None),
     ),
