@@ -22,8 +22,9 @@ ATTRIBUTES: Mapping[Stream, tuple[str, ...]] = {
     "codes": ("means", "log_scales", "quats", "sh0", "shN"),
     "container": (),
 }
-"""Arrays of the cloud whose errors a stream decides. Scales and rotations go together, since encoders rename axes.
-"codes" moves codes of all of them to cheap neighbors; "splats" decides which splats are there at all, "container" how bytes are packed, which changes no value."""
+"""Arrays of the cloud whose errors a stream decides. Scales and rotations go together, since encoders rename axes. "codes"
+moves codes of all of them to cheap neighbors; "splats" decides which splats are there at all, "container" how bytes are
+packed, which changes no value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
