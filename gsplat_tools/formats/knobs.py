@@ -64,7 +64,7 @@ SIZES = tuple(round(2 ** (step / 2)) for step in range(10, 31))
 """Entries of codebooks and palettes, 32 to 32,768, each sqrt(2) times the one before."""
 
 
-TOLERANCES = (0.3, 0.2, 0.1, 0.05, 0.02, 0.0)
+TOLERANCES = (0.3, 0.2, 0.14, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.0)
 """Pixels of `visual_tolerance`."""
 
 

@@ -69,15 +69,11 @@ class SogOptions:
             raise CapabilityError(f"visual_tolerance must be 0 to {MAX_PIXELS:g} pixels, got {self.visual_tolerance}")
 
 
-TOLERANCES = (0.2, 0.14, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.0)
-"""Visual tolerances in pixels; most of what they save is in positions."""
-
 KNOBS: dict[str, Knob] = {
     **general_knobs(3),
     "sh_palette_size": Knob(values=SIZES, stream="sh", graded=True, needs={"sh_degree": (1, 2, 3)}),
-    "visual_tolerance": Knob(values=TOLERANCES, stream="positions", graded=True),
     "rotation": Knob(values=("small", "best"), stream="rotations"),
-    "visual_tolerance": Knob(values=TOLERANCES, stream="codes"),
+    "visual_tolerance": Knob(values=TOLERANCES, stream="codes", graded=True),
     "webp_effort": Knob(values=(1, 3, 9), stream="container"),
 }
 

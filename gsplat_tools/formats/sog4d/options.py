@@ -137,9 +137,6 @@ class Sog4dOptions:
             raise CapabilityError(f"visual_tolerance must be 0 to {MAX_PIXELS:g} pixels, got {self.visual_tolerance}")
 
 
-TOLERANCES = (0.2, 0.14, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.0)
-"""Visual tolerances in pixels; most of what they save is in positions."""
-
 KNOBS: dict[str, Knob] = {
     **general_knobs(3),
     "version": Knob(values=(1, 2), stream="sh", needs={"sh_degree": (2, 3)}),
@@ -148,7 +145,6 @@ KNOBS: dict[str, Knob] = {
     "sh0_entries": Knob(
         values=(4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 80, 96, 128, 160, 192, 224, 256), stream="colors", graded=True
     ),
-    "visual_tolerance": Knob(values=TOLERANCES, stream="positions", graded=True),
     "rotation": Knob(values=("small", "best"), stream="rotations"),
     "rotation_steps": Knob(
         values=(16, 18, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 112, 127),
@@ -157,7 +153,7 @@ KNOBS: dict[str, Knob] = {
         needs={"rotation": ("small",)},
     ),
     "keep_tolerance": Knob(values=(0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.0), stream="labels", sequences_only=True),
-    "visual_tolerance": Knob(values=TOLERANCES, stream="codes"),
+    "visual_tolerance": Knob(values=TOLERANCES, stream="codes", graded=True),
     "webp_effort": Knob(values=(1, 3, 7), stream="container"),
 }
 
