@@ -11,7 +11,7 @@ import pytest
 
 from gsplat_tools.errors import ReadError, WriteError
 from gsplat_tools.formats import _files
-from gsplat_tools.formats._files import RecordedFile, SourceFile, Spool, open_source_file
+from gsplat_tools.formats._files import RecordedFile, SourceFile, Spool, checksum, open_source_file
 
 
 def made(path: Path) -> RecordedFile:
@@ -23,7 +23,7 @@ def made(path: Path) -> RecordedFile:
 def test_recorded_file__agrees_with_whatever_was_written_where(
     seed: int, buffered: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_files, "SEGMENT_BYTES", 100)
+    monkeypatch.setattr(_files, "BLOCK_BYTES", 100)
     rng = np.random.default_rng(seed)
     expected = bytearray()
     raw = made(tmp_path / "a.bin")
@@ -44,12 +44,12 @@ def test_recorded_file__agrees_with_whatever_was_written_where(
 
 @pytest.mark.parametrize("position", [0, 3, 99, 100, 101, 150, 249])
 def test_recorded_file__finds_every_changed_byte(position: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_files, "SEGMENT_BYTES", 100)
+    monkeypatch.setattr(_files, "BLOCK_BYTES", 100)
     path = tmp_path / "a.bin"
     with made(path) as file:
         file.write(bytes(range(250)))
         file.seek(95)
-        file.write(b"header12")  # over the border of two segments
+        file.write(b"header12")  # over the border of two blocks
 
         change(path, position, lambda byte: byte ^ 4)
         assert file.first_difference() == position // 100 * 100
@@ -133,3 +133,39 @@ def test_source_file__reads_everything(tmp_path: Path) -> None:
 
     with SourceFile(tmp_path / "a.bin") as file:
         assert file.readall() == bytes(3_000_000)
+
+
+@pytest.mark.parametrize("size", [0, 1, 7, 8, 8167, 8168, 8169, 100_003, _files.BLOCK_BYTES])
+def test_checksum__sees_every_flipped_bit(size: int) -> None:
+    data = bytearray(np.random.default_rng(size).bytes(size))
+    right = checksum(data)
+    assert right == checksum(bytes(data))
+
+    for bit in {*range(0, 8 * size, max(1, size // 50)), *range(max(0, 8 * size - 70), 8 * size)}:
+        data[bit // 8] ^= 1 << bit % 8
+        assert checksum(data) != right
+        data[bit // 8] ^= 1 << bit % 8
+
+
+@pytest.mark.parametrize("unit", [1, 4, 8, 512, 4096, 65536])
+def test_checksum__sees_what_disks_do(unit: int) -> None:
+    rng = np.random.default_rng(unit)
+    original = rng.normal(size=_files.BLOCK_BYTES // 8).view(np.uint8)
+    right = checksum(original.data)
+    units = len(original) // unit
+    for _ in range(100):
+        i, j = rng.choice(units, 2, replace=False) * unit
+        lost, swapped, shifted = original.copy(), original.copy(), original.copy()
+        lost[i : i + unit] = 0
+        swapped[i : i + unit], swapped[j : j + unit] = original[j : j + unit], original[i : i + unit]
+        low = min(i, len(original) - 2 * unit)
+        shifted[low + unit :] = original[low:-unit]
+        for damaged in (lost, swapped, shifted):
+            assert (checksum(damaged.data) == right) == np.array_equal(damaged, original)
+
+
+@pytest.mark.parametrize("bit", range(64))
+def test_checksum__sees_a_line_that_is_stuck(bit: int) -> None:
+    stuck = np.full(_files.BLOCK_BYTES // 8, 1 << bit, np.uint64)
+
+    assert checksum(stuck.tobytes()) != checksum(bytes(_files.BLOCK_BYTES))
