@@ -215,7 +215,8 @@ def main(
     gsplat-convert 'frames/*.ply' scene.sog4d
     gsplat-convert scene.sog4d frames/ --to ply
     """  # noqa: D301 - \b keeps click from joining the lines
-    from gsplat_tools.convert import convert, estimate
+    from gsplat_tools.convert import convert
+    from gsplat_tools.estimation import estimate
     from gsplat_tools.parallel import use_jobs
 
     for source in sources:
@@ -284,8 +285,8 @@ def _every_frame(
 
 def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, Any]]:
     """Return the arguments of `convert` for every target from the options that were given."""
-    from gsplat_tools.convert import Validation
     from gsplat_tools.retiming import Motion
+    from gsplat_tools.verification import Validation
 
     own: list[tuple[str, str, Any]] = []
     for flag, name, _ in FORMAT_OPTIONS:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ import numpy as np
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, UnknownFormatError
 from gsplat_tools.formats._stores import is_url, local_path, matching
-from gsplat_tools.formats.base import FileInfo, Format
-from gsplat_tools.formats.loading import inspect_file, located, open_scene
+from gsplat_tools.formats.base import FileInfo, Format, Scene
+from gsplat_tools.formats.loading import inspect_file, is_single, located, open_scene
 from gsplat_tools.formats.registry import format_of_extension
 from gsplat_tools.sequence import GaussianSequence
 
@@ -204,3 +205,34 @@ def _single_bundle(path: Path, frame_times: Sequence[float] | None) -> GaussianS
         frame_times=times,
         load_bounds=sequence.bounds,
     )
+
+
+@contextmanager
+def open_sources(
+    sources: Sequence[str | Path], *, in_chunks: bool, read_options: dict[str, Any], options: dict[str, Any]
+) -> Iterator[tuple[Scene, str]]:
+    """Open what one conversion reads: a file, or several, a folder or a glob as a sequence.
+
+    Parameters
+    ----------
+    sources
+        Paths as `convert` takes them.
+    in_chunks
+        Whether a file is read in chunks where its format allows.
+    read_options
+        Read options of the source's format.
+    options
+        Of the conversion; `frame_times` is taken out of them for a sequence.
+
+    Yields
+    ------
+    tuple
+        The scene, invalid splats included, and the id of its format.
+    """
+    if len(sources) == 1 and is_single(Path(sources[0])):
+        found: list[Format] = []
+        with open_scene(Path(sources[0]), in_chunks=in_chunks, on_format=found.append, **read_options) as scene:
+            yield scene, found[0].id
+        return
+    sequence = open_sequence(sources, frame_times=options.pop("frame_times", None))
+    yield sequence, inspect_file(frame_files(sources)[0])[0].id

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, BinaryIO, Literal
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.codecs.visionary_buffers import MAX_SH_DEGREE
-from gsplat_tools.comparison import AttributeTally, compare_rendered
+from gsplat_tools.comparison import AttributeTally, compare_rendered, sample
 from gsplat_tools.errors import GsplatWarning
-from gsplat_tools.formats.base import Format
+from gsplat_tools.formats.base import Format, Scene
+from gsplat_tools.formats.loading import drop_or_refuse
 from gsplat_tools.formats.registry import FORMATS
 from gsplat_tools.ops.harmonics import with_sh_degree
 from gsplat_tools.ops.ordering import order_splats
+from gsplat_tools.sequence import GaussianSequence
 
 Precision = Literal["f32", "f16", "i8"]
 Clip = float | Literal["auto"]
@@ -167,3 +169,11 @@ def _stored(cloud: GaussianCloud, record: Format, options: dict[str, Any]) -> tu
     stored = record.read(stream, record.read_options())
     assert isinstance(stored, GaussianCloud)
     return stored, stream, size
+
+
+def rendered_clip(scene: Scene, options: Mapping[str, Any]) -> Clip:
+    """Return the clip that the int8 format writes a scene best with; see `choose_clip`."""
+    if isinstance(scene, GaussianSequence):
+        return "auto"  # refused by the writer
+    cloud = drop_or_refuse(sample(scene), strict=False)
+    return choose_clip(cloud, **{name: value for name, value in options.items() if name == "position_bits"}).clip

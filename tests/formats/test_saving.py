@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from gsplat_tools.chunks import as_chunks
-from gsplat_tools.convert import Validation, convert
+from gsplat_tools.convert import convert
 from gsplat_tools.errors import CapabilityError, CloudError, GsplatWarning, LossyConversionWarning, ValidationError
 from gsplat_tools.formats import FORMATS, load, save
 from gsplat_tools.formats.preparing import SaveChoices, prepare
+from gsplat_tools.verification import Validation
 from tests.clouds import random_cloud
 
 
