@@ -13,6 +13,7 @@ from gsplat_tools.cli import _options as options
 from gsplat_tools.cli import _output as output
 from gsplat_tools.cli import _tuning as tuning
 from gsplat_tools.cli._errors import one_line, reports_errors
+from gsplat_tools.cli._help import SectionedCommand
 from gsplat_tools.errors import counts_in_words
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.preparing import SaveChoices
@@ -94,7 +95,7 @@ def _takes(record: Format, flag: str, name: str) -> bool:
     return name in own_fields and (name != "version" or flag == f"--{record.id}-version")
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.command(cls=SectionedCommand, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.argument("sources", nargs=-1, required=True, metavar="SOURCE...")
 @click.argument("target", type=click.Path(path_type=Path))
 @click.option(

@@ -283,3 +283,19 @@ def test_dry_run__estimates_and_writes_nothing(tmp_path: Path) -> None:
     assert report["target"]["format"] == "spark"
     run(source, tmp_path / "out.gspk")
     assert (tmp_path / "out.gspk").stat().st_size == report["bytes"]
+
+
+def test_help__has_every_option_once_under_a_heading() -> None:
+    text = run("--help").stdout
+
+    for heading in ("Target:", "Budget:", "Splats:", "Sequences and motion:", "Check:", "Single formats:", "Running:"):
+        assert text.count(f"\n{heading}\n") == 1
+    for option in main.params:
+        if option.param_type_name == "option" and not getattr(option, "hidden", False):
+            assert (
+                text.count(f"\n  {option.opts[-1]} ")
+                + text.count(f", {option.opts[-1]} ")
+                + text.count(f"\n  {option.opts[0]} ")
+                >= 1
+            )
+    assert text.count("--visual-tolerance") == 1
