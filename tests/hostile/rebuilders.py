@@ -133,7 +133,10 @@ def gspk(layout: str) -> Callable[[Random], bytes]:
                     description.clear()
                     description.update(changed)
 
-        return gspk_file(layout, change=change, **changes)
+        try:
+            return gspk_file(layout, change=change, **changes)
+        except RecursionError:  # of the encoder
+            return gspk_file(layout, **changes)
 
     return rebuild
 
