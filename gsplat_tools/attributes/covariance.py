@@ -106,13 +106,14 @@ def decompose(triangles: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDA
     -----
     Dropping what is negative does not move a matrix further from any covariance: covariances are a convex cone.
     """
+    from gsplat_tools.kernels.symmetric_eigen import decompose as decompose_block
+
     is_finite = np.isfinite(triangles).all(axis=1)
-    matrices = to_matrices(np.where(is_finite[:, None], triangles, 0.0).astype(np.float64))
-    # Subnormal and huge entries keep their digits: powers of two are exact.
-    exponents = np.frexp(np.abs(matrices).max(axis=(1, 2), initial=0.0))[1]
-    values, vectors = np.linalg.eigh(np.ldexp(matrices, -exponents[:, None, None]))
-    vectors[:, :, 0] *= np.sign(np.linalg.det(vectors))[:, None]  # a rotation, not a reflection
+    finite = np.where(is_finite[:, None], triangles, 0.0).astype(np.float64)
+    values, exponents = np.empty((len(finite), 3)), np.empty(len(finite), np.int64)
+    quats = np.empty((len(finite), 4), np.float32)
+    decompose_block(finite, values, exponents, quats)
     with np.errstate(divide="ignore"):
         logs = 0.5 * (np.log(np.maximum(values, 0.0)) + exponents[:, None] * np.log(2.0))
     logs[~is_finite] = np.nan
-    return quaternions.from_matrix(vectors).astype(np.float32), logs.astype(np.float32)
+    return quats, logs.astype(np.float32)
