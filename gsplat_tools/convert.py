@@ -185,7 +185,7 @@ def convert(
         sh_degree=saved.sh_degree,
         frames=saved.frames,
         dropped=dict(Counter(retimed.dropped) + Counter(saved.dropped)),
-        warnings=_unique_warnings(caught),
+        warnings=unique_warnings(caught),
         seconds=seconds,
         validation=outcome.get("validation"),
         options={**saved.options, **retimed.facts},
@@ -208,7 +208,7 @@ def _tune(scene: Scene, record: Format, budget: Budget | None, preset: str, opti
     return tune(scene, record, preset=preset, options=options, budget=budget, views=how.views, size=how.size, model=model)
 
 
-def _unique_warnings(caught: Sequence[warnings.WarningMessage]) -> list[dict[str, str]]:
+def unique_warnings(caught: Sequence[warnings.WarningMessage]) -> list[dict[str, str]]:
     """Return our warnings as code and message, each once; pass everyone else's on."""
     messages: dict[tuple[str, str], dict[str, str]] = {}
     for warning in caught:

@@ -15,6 +15,7 @@
     ├── ReadError (OSError)             the operating system could not read a source
     ├── WriteError (OSError)            it could not write a target, or the bytes did not come back as they were written
     ├── ValidationError (ValueError)      what was written does not hold its bounds, or --min-psnr
+    ├── ClusterError (RuntimeError)       workers or the connection to them were lost; what is finished is kept
     └── MissingDependencyError (ImportError)  optional package absent; says what to install
     GsplatWarning (UserWarning)
     ├── LossyConversionWarning            what was dropped or clamped, and how many
@@ -135,6 +136,10 @@ class WriteError(GsplatError, OSError):
 
 class ValidationError(GsplatError, ValueError):
     """What was written does not hold its derived bounds, or renders below the quality asked for."""
+
+
+class ClusterError(GsplatError, RuntimeError):
+    """Workers, or the connection to their scheduler, were lost, or they are unlike each other."""
 
 
 class MissingDependencyError(GsplatError, ImportError):  # type: ignore[misc] # both have a `path`

@@ -154,6 +154,11 @@ def compare_rendered(
                 )
                 if see is not None:
                     see(views[-1].name, images[0], images[1])
+    return summarize_views(views, name if variant is None else f"{name} {variant}", rendered)
+
+
+def summarize_views(views: Sequence[ViewReport], model: str, rendered_splats: int) -> ComparisonReport:
+    """Return what single views, at least one, say together."""
     levels = [view.psnr for view in views if view.psnr is not None]
     similarities = [view.ssim for view in views if view.ssim is not None]
     worst = min(views, key=lambda view: np.inf if view.psnr is None else view.psnr)
@@ -166,8 +171,8 @@ def compare_rendered(
         worst_view=worst.name,
         attributes={},
         views=views,
-        model=name if variant is None else f"{name} {variant}",
-        rendered_splats=rendered,
+        model=model,
+        rendered_splats=rendered_splats,
     )
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import BinaryIO, Literal
 
 from gsplat_tools.errors import CorruptDataError, LimitExceededError, ReadError
@@ -212,6 +213,27 @@ class _UnfinishedArchive(zipfile.ZipFile):
         pass
 
 
+def _record(name: str, compression: Compression) -> zipfile.ZipInfo:
+    """Return a directory record with what is the same for all entries."""
+    info = zipfile.ZipInfo(name, _FIXED_TIME)
+    info.create_system = 3  # else it differs by operating system
+    info.external_attr = 0o644 << 16
+    info.compress_type = zipfile.ZIP_STORED if compression == "stored" else zipfile.ZIP_DEFLATED
+    return info
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An entry that lies finished somewhere: what its directory record needs, and where it starts there."""
+
+    name: str
+    compression: Compression
+    checksum: int
+    stored_size: int
+    size: int
+    offset: int
+
+
 class ZipWriter:
     """Writes entries one after another with fixed times and modes, so that equal entries give equal bytes.
 
@@ -222,15 +244,60 @@ class ZipWriter:
     """
 
     def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
         self._archive = _UnfinishedArchive(stream, "w", allowZip64=True)
 
     def add(self, name: str, data: bytes, compression: Compression) -> None:
         """Append one entry."""
-        info = zipfile.ZipInfo(name, _FIXED_TIME)
-        info.create_system = 3  # else it differs by operating system
-        info.external_attr = 0o644 << 16
-        info.compress_type = zipfile.ZIP_STORED if compression == "stored" else zipfile.ZIP_DEFLATED
-        self._archive.writestr(info, data, compresslevel=9)
+        self._archive.writestr(_record(name, compression), data, compresslevel=9)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the entries so far."""
+        return self._archive.start_dir
+
+    @property
+    def entries(self) -> list[Entry]:
+        """The entries so far, for `graft`."""
+        return [
+            Entry(
+                info.filename,
+                "stored" if info.compress_type == zipfile.ZIP_STORED else "deflated",
+                info.CRC,
+                info.compress_size,
+                info.file_size,
+                info.header_offset,
+            )
+            for info in self._archive.infolist()
+        ]
+
+    def graft(self, entries: Sequence[Entry], data: Iterable[bytes], *, start: int = 0) -> None:
+        """Append entries that another writer made, without looking into them; the stream need not seek.
+
+        Parameters
+        ----------
+        entries
+            Their records, in order.
+        data
+            The bytes of that writer from `start` on, up to the end of the last entry.
+        start
+            Where the data begins in the other writer's bytes.
+        """
+        archive, stream = self._archive, self._stream
+        base = archive.start_dir
+        if stream.seekable():
+            stream.seek(base)
+        end = base
+        for part in data:
+            stream.write(part)
+            end += len(part)
+        for entry in entries:
+            info = _record(entry.name, entry.compression)
+            info.CRC, info.compress_size, info.file_size = entry.checksum, entry.stored_size, entry.size
+            info.header_offset = base + entry.offset - start
+            archive.filelist.append(info)
+            archive.NameToInfo[info.filename] = info
+        archive.start_dir = end
 
     def close(self) -> None:
         """Write the directory."""

@@ -6,8 +6,8 @@ Frames may be looked at anywhere and in any order; what is decided depends on th
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,39 +76,35 @@ class FrameFit:
         return self.fit.apply(frame.take(self.selection))
 
 
-def fit_frames(
-    first: GaussianCloud,
-    facts: Iterable[FrameFacts],
-    look_again: Callable[[NDArray[np.bool_]], Iterable[FrameFacts]],
-    target: Format,
-    choices: SaveChoices,
-) -> tuple[FrameFit, dict[str, int]]:
-    """Decide how all frames are fitted: a splat that goes in one frame goes in all, and the first frame gives the order.
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What all frames together tell.
 
     Parameters
     ----------
-    first
-        The first frame.
-    facts
-        What every frame tells, in their order.
-    look_again
-        Called where splats go, with (N,) whether each stays; returns what every frame tells then.
-    target, choices
-        Format that will be written, and what was asked for.
+    keeps
+        (N,) whether each splat stays; one that goes in one frame goes in all.
+    scan
+        Bounds and highest band of all splats; where some go, those that stay have to be looked at again.
+    dropped
+        Splats left out, per cause.
+    """
 
-    Returns
-    -------
-    tuple
-        What was decided · splats left out, per cause.
+    keeps: NDArray[np.bool_]
+    scan: Scan
+    dropped: dict[str, int]
+
+
+def kept_splats(facts: Iterable[FrameFacts], count: int, choices: SaveChoices) -> Kept:
+    """Return which of `count` splats stay, from what every frame tells, in their order.
 
     Raises
     ------
-    CapabilityError, CloudError
-        See `prepare`.
+    CloudError
+        `strict` and there are invalid splats.
     """
     from gsplat_tools.ops.filtering import count_causes
 
-    count = len(first)
     keeps = np.ones(count, np.bool_)
     visible = np.packbits(np.full(count, choices.prune_opacity == 0))
     causes: Counter[str] = Counter()
@@ -127,21 +123,35 @@ def fit_frames(
     pruned = int(np.count_nonzero(keeps & ~is_visible))
     if pruned:
         causes["pruned-opacity"] = pruned
-    keeps &= is_visible
-    if not keeps.all():  # what was found holds for all splats; look again at those that stay
-        scan = Scan(num_splats=count)
-        for each in look_again(keeps):
-            scan.merge(each.scan)
-    scan.dropped = causes
+    return Kept(keeps & is_visible, scan, dict(causes))
+
+
+def with_scan(kept: Kept, facts: Iterable[FrameFacts]) -> Kept:
+    """Return the same with the bounds of what stays, from a second look at every frame."""
+    scan = Scan(num_splats=len(kept.keeps))
+    for each in facts:
+        scan.merge(each.scan)
+    return replace(kept, scan=scan)
+
+
+def decide_fit(first: GaussianCloud, kept: Kept, target: Format, choices: SaveChoices) -> FrameFit:
+    """Decide how all frames are fitted; the first frame gives the order.
+
+    Raises
+    ------
+    CapabilityError, CloudError
+        See `prepare`.
+    """
+    scan = replace(kept.scan, dropped=Counter(kept.dropped))
     fit = Fit(first.take(slice(0, 0)), target, choices, scan)
-    fitted = fit.apply(first.take(keeps))
+    fitted = fit.apply(first.take(kept.keeps))
     order = choices.order or target.order
-    selection = np.flatnonzero(keeps)
+    selection = np.flatnonzero(kept.keeps)
     if order != "none":
         from gsplat_tools.ops.ordering import splat_order
 
         selection = selection[splat_order(fitted, order)]
-    return FrameFit(fit, selection, fitted.sh_degree), dict(causes)
+    return FrameFit(fit, selection, fitted.sh_degree)
 
 
 def prepare_sequence(sequence: GaussianSequence, target: Format, choices: SaveChoices) -> Prepared:
@@ -159,10 +169,10 @@ def prepare_sequence(sequence: GaussianSequence, target: Format, choices: SaveCh
                 yield look_at_frame(frame, choices)
                 progress.advance(1)
 
-    fit, dropped = fit_frames(
-        first, facts(), lambda keeps: (look_at_frame(frame, choices, keeps) for frame in frames()), target, choices
-    )
-    return Prepared(fitted_sequence(sequence, fit), dropped)
+    kept = kept_splats(facts(), len(first), choices)
+    if not kept.keeps.all():
+        kept = with_scan(kept, (look_at_frame(frame, choices, kept.keeps) for frame in frames()))
+    return Prepared(fitted_sequence(sequence, decide_fit(first, kept, target, choices)), kept.dropped)
 
 
 def fitted_sequence(sequence: GaussianSequence, fit: FrameFit) -> GaussianSequence:

@@ -14,7 +14,7 @@ from gsplat_tools.formats.sog4d.meta import Segment
 
 MAGIC = b"SOG4DLB1"
 
-__all__ = ["MAGIC", "Labels", "changes", "most_bytes", "read_delta", "write_delta"]
+__all__ = ["MAGIC", "Labels", "changes", "most_bytes", "moved_delta", "read_delta", "write_delta"]
 
 
 def write_delta(segment: tuple[int, int], splat_count: int, label_count: int, blocks: Sequence[NDArray[Any]]) -> bytes:
@@ -23,6 +23,11 @@ def write_delta(segment: tuple[int, int], splat_count: int, label_count: int, bl
         field="", start_frame=segment[0], frame_count=segment[1], splat_count=splat_count, label_count=label_count
     )
     return _label_delta.write_delta(described, blocks, magic=MAGIC)
+
+
+def moved_delta(data: bytes, start: int) -> bytes:
+    """Return a delta file of ours as if its segment started at another frame."""
+    return data[:12] + start.to_bytes(4, "little") + data[16:]
 
 
 def most_bytes(segment: Segment, splat_count: int) -> int:

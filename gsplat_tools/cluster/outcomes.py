@@ -1,0 +1,67 @@
+"""What a task brings home besides its result: warnings and seconds; and how it is run alone in its process."""
+
+from __future__ import annotations
+
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from gsplat_tools.errors import GsplatWarning, ReadError, WriteError
+from gsplat_tools.parallel import use_jobs
+
+# Tasks use all the threads they are given by themselves, and the list of warnings is one for all threads of a process.
+_alone = threading.Lock()
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a task returned, or how it failed in a way that trying again does not change."""
+
+    value: Any = None
+    error: Exception | None = None
+    warnings: list[GsplatWarning] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def result(self) -> Any:
+        """Return the value, or raise the error."""
+        if self.error is not None:
+            raise self.error
+        return self.value
+
+
+def is_passing(error: BaseException) -> bool:
+    """Whether an error may be gone when the task is tried again, perhaps elsewhere: disks, stores and memory."""
+    return isinstance(error, ReadError | WriteError | ConnectionError | TimeoutError | MemoryError) or (
+        isinstance(error, OSError) and not isinstance(error, FileNotFoundError | FileExistsError | PermissionError)
+    )
+
+
+def run_task(function: Callable[..., Any], jobs: int | None, *arguments: Any) -> Outcome:
+    """Run a task; errors that may pass are raised, so that the engine tries again, others are returned."""
+    given = [each.result() if isinstance(each, Outcome) else each for each in arguments]
+    start = time.perf_counter()
+    with _alone, use_jobs(jobs), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", GsplatWarning)
+        outcome = Outcome()
+        try:
+            outcome.value = function(*given)
+        except Exception as error:
+            if is_passing(error):
+                raise
+            outcome.error = error
+    outcome.warnings = [each.message for each in caught if isinstance(each.message, GsplatWarning)]
+    outcome.seconds = time.perf_counter() - start
+    return outcome
+
+
+def warn_again(outcomes: list[Outcome]) -> None:
+    """Give the warnings of tasks to whoever listens here, each once."""
+    seen: set[tuple[str, str]] = set()
+    for outcome in outcomes:
+        for warning in outcome.warnings:
+            if (warning.code, str(warning)) not in seen:
+                seen.add((warning.code, str(warning)))
+                warnings.warn(warning, stacklevel=3)

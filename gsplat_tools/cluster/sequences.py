@@ -1,0 +1,439 @@
+"""A long sequence to a bundle: frames looked at, codebooks fitted and segments encoded as tasks, parts joined in order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsplat_tools.cluster import tasks
+from gsplat_tools.cluster.checking import Checks, merged_tally
+from gsplat_tools.cluster.engines import Dask, Engine
+from gsplat_tools.cluster.outcomes import Outcome, warn_again
+from gsplat_tools.cluster.parts import Part, part_bytes
+from gsplat_tools.comparison.rendered import summarize_views
+from gsplat_tools.convert import ConversionReport, unique_warnings
+from gsplat_tools.errors import CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError, WriteError
+from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.formats._limits import max_memory
+from gsplat_tools.formats._stores import LARGE_BLOCK_BYTES, exists, is_url, local_path, remove, replacing_object, url_of
+from gsplat_tools.formats._zip import ZipWriter
+from gsplat_tools.formats.loading import inspect_file
+from gsplat_tools.formats.preparing import SaveChoices
+from gsplat_tools.formats.preparing_frames import Kept, kept_splats, with_scan
+from gsplat_tools.formats.saving import DEFAULT_PRESET, check_header, find_target, split_options
+from gsplat_tools.formats.sequences import frame_files
+from gsplat_tools.formats.sog4d.codebooks import Shared
+from gsplat_tools.formats.sog4d.encode import choose_layout, choose_times, last_entries, warn_clipped
+from gsplat_tools.formats.sog4d.options import Sog4dOptions
+from gsplat_tools.formats.sog4d.segments import choose_segments, data_compression, has_deltas
+from gsplat_tools.progress import stage
+from gsplat_tools.sequence import GaussianSequence
+from gsplat_tools.verification import DEFAULT_VALIDATION, VALIDATED_FRAMES, Validation
+
+PARTS_SUFFIX = ".gsplat-parts"
+"""Added to the target's name, with a dot before it: the folder of finished segments."""
+
+_TASKS_A_WORKER = 8
+_MOST_FRAMES = 64
+"""Of a task that only looks at frames."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SequenceReport(ConversionReport):
+    """A conversion report, and what the cluster did."""
+
+    cluster: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the report with the fixed names of the command line's JSON."""
+        return {**ConversionReport.to_json(self), "cluster": self.cluster}
+
+
+class _Stages:
+    """Runs the tasks of each stage, shows progress, and adds up what they took."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self.outcomes: list[Outcome] = []
+        self.spent: dict[str, dict[str, float]] = {}
+
+    def run(self, name: str, label: str, pending: Sequence[Any], sizes: Sequence[int]) -> Iterator[Any]:
+        """Yield results in order; `sizes` are the frames of each task."""
+        start, busy = time.perf_counter(), 0.0
+        with stage(label, sum(sizes), "frames") as progress:
+            for outcome, size in zip(self.engine.results(pending), sizes, strict=True):
+                busy += outcome.seconds
+                value = outcome.result()
+                self.outcomes.append(Outcome(warnings=outcome.warnings))
+                progress.advance(size)
+                yield value
+        self.note(name, tasks=len(pending), seconds=time.perf_counter() - start, task_seconds=busy)
+
+    def note(self, name: str, **numbers: float) -> None:
+        """Add to what a stage took."""
+        stage_numbers = self.spent.setdefault(name, {})
+        for key, number in numbers.items():
+            stage_numbers[key] = round(stage_numbers.get(key, 0) + number, 4)
+
+
+def convert_sequence(
+    sources: Sequence[str | Path],
+    target: str | Path,
+    engine: Engine,
+    *,
+    overwrite: bool = False,
+    preset: str = DEFAULT_PRESET,
+    validation: Validation | None = DEFAULT_VALIDATION,
+    parts: str | None = None,
+    **options: Any,
+) -> SequenceReport:
+    """Convert frames to a .sog4d bundle; the same bytes as `convert` gives, wherever the tasks run.
+
+    Parameters
+    ----------
+    sources
+        Frames: several files or URLs, a folder, or a pattern. Workers must see them under the same names.
+    target
+        File or URL to write; this process assembles it.
+    engine
+        Where the tasks run.
+    overwrite
+        Replace a target that is there.
+    preset
+        As `convert` takes it.
+    validation
+        How every segment is checked before the bundle is published; None checks nothing.
+    parts
+        Folder or URL for finished segments, which workers and this process see; by default beside the target. A run that
+        ended early leaves them, and the next one continues there; they are removed once the bundle is published.
+    **options
+        Choices of `SaveChoices` and write options of the format; `frame_times` as `convert` takes them.
+
+    Returns
+    -------
+    SequenceReport
+        As of `convert`, and the seconds and bytes of every stage.
+
+    Raises
+    ------
+    GsplatError
+        As `convert`.
+    ClusterError
+        Workers or the connection to them were lost for good; the same call continues.
+    """
+    start = time.perf_counter()
+    target = Path(local_path(target))
+    record = find_target(target, None)
+    if record.id != "sog4d":
+        raise CapabilityError(f"a cluster makes one .sog4d bundle of a sequence, not {record.title}", path=target)
+    if exists(target) and not overwrite:
+        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=target)
+    frame_times = options.pop("frame_times", None)
+    choices, write_options = split_options(record, preset, options)
+    files = frame_files([local_path(each) for each in sources])
+    first_record, first = inspect_file(files[0])
+    if first_record.holds_sequences and first.frames > 1:
+        raise CapabilityError("a bundle is converted on one machine; leave out --scheduler", path=files[0])
+    names = tuple(url_of(path) if is_url(path) else str(path.absolute()) for path in files)
+    source = tasks.FrameSource(files=names, first=first, max_memory=max_memory())
+    times = choose_times(_times_of(source, frame_times), len(files), write_options)
+    stages = _Stages(engine)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", GsplatWarning)
+        _check_alike(engine)
+        job = _Job(source, choices, write_options, stages, _checks(record.model, len(files), validation))
+        kept, fit, shared = job.fit()
+        looked = time.perf_counter()
+        folder = parts or _beside(target)
+        found = job.encode(fit, shared, folder)
+        encoded = time.perf_counter()
+        validated = _judge(found, validation, record.model)
+        warn_again(stages.outcomes)
+        facts = [part.facts for part in found]
+        warn_clipped(facts)
+        shared_here: Shared = next(iter(stages.run("collect", "fetching codebooks", [shared], [0])))
+        num_splats = int(np.count_nonzero(kept.keeps))
+        entries = last_entries(shared_here, num_splats, job.segments, times, facts, uses_deltas=job.uses_deltas)
+        size, digest = _assemble(target, found, entries, shared_here, overwrite=overwrite, stages=stages)
+        if not is_url(target):
+            _check_published(target, num_splats, len(files), shared_here.bands)
+        _remove_parts(folder)
+    return SequenceReport(
+        source=", ".join(map(url_of, sources)),
+        source_format=first_record.id,
+        path=target,
+        format=record.id,
+        bytes=size,
+        splats=num_splats,
+        sh_degree=shared_here.bands,
+        frames=len(files),
+        dropped=kept.dropped,
+        warnings=unique_warnings(caught),
+        seconds={
+            "read": looked - start,
+            "encode": encoded - looked,
+            "write": time.perf_counter() - encoded,
+            "validate": sum(part.seconds.get("validate", 0) for part in found) / max(engine.workers, 1),
+        },
+        validation=validated,
+        options={name: getattr(write_options, name) for name in write_options.__dataclass_fields__},
+        cluster={
+            "scheduler": engine.name,
+            "workers": engine.workers,
+            "dashboard": engine.dashboard,
+            "segments": len(found),
+            "kept_segments": sum(part.kept for part in found),
+            "retried": engine.retried,
+            "sha256": digest,
+            "stages": stages.spent,
+        },
+    )
+
+
+class _Job:
+    """The tasks of one sequence."""
+
+    def __init__(
+        self, source: tasks.FrameSource, choices: SaveChoices, options: Sog4dOptions, stages: _Stages, checks: Checks | None
+    ) -> None:
+        self.source, self.choices, self.options, self.stages, self.checks = source, choices, options, stages, checks
+        self.num_frames = len(source.files)
+        self.segments = choose_segments(self.num_frames, options.delta_segment_length)
+        self.uses_deltas = has_deltas(self.num_frames, options)
+        step = min(_MOST_FRAMES, max(1, -(-self.num_frames // (_TASKS_A_WORKER * stages.engine.workers))))
+        self.batches = [(start, min(start + step, self.num_frames)) for start in range(0, self.num_frames, step)]
+
+    def fit(self) -> tuple[Kept, Any, Any]:
+        """Return which splats stay, and the tasks that fit frames and codebooks."""
+        self.identities = self._over_frames("identify", "looking for frames", tasks.identify_frames)
+        facts = self._over_frames("look", "checking frames", tasks.look_at_frames, self.choices)
+        kept = kept_splats(facts, self.source.first.splats, self.choices)
+        if not kept.keeps.any():
+            raise CapabilityError("a .sog4d bundle needs at least one splat, and none is left to write")
+        if not kept.keeps.all():
+            kept = with_scan(kept, self._over_frames("look", "checking frames", tasks.look_at_frames, self.choices, kept.keeps))
+        layout = choose_layout(int(np.count_nonzero(kept.keeps)), self.options)
+        submit = self.stages.engine.submit
+        fit = submit(tasks.decide, self.source, kept, self.choices)
+        # The samples stay where they are drawn until the codebooks are fitted.
+        drawn = [submit(tasks.draw_frames, self.source, *batch, fit, self.options.seed) for batch in self.batches]
+        shared = submit(tasks.fit_codebooks, self.source, fit, self.options, layout, *drawn)
+        for _ in self.stages.run("fit", "fitting codebooks", [fit, shared], [0, self.num_frames]):
+            pass
+        return kept, fit, shared
+
+    def encode(self, fit: Any, shared: Any, folder: str) -> list[Part]:
+        """Encode all segments to parts in a folder."""
+        key = self._key()
+        if not is_url(folder):
+            Path(folder).mkdir(parents=True, exist_ok=True)
+        pending, sizes = [], []
+        for segment in self.segments:
+            own = hashlib.sha256(f"{key} {segment}".encode()).hexdigest()
+            path = f"{folder}/{segment[0]:06d}-{own[:16]}.part"
+            pending.append(
+                self.stages.engine.submit(
+                    tasks.encode_segment, self.source, fit, shared, segment, path, own, self.uses_deltas, self.checks
+                )
+            )
+            sizes.append(segment[1])
+        found: list[Part] = list(self.stages.run("encode", "encoding", pending, sizes))
+        for part in found:
+            seconds = {} if part.kept else {f"{name}_seconds": spent for name, spent in part.seconds.items()}
+            end = max(entry.offset + entry.stored_size for entry in part.entries)
+            self.stages.note("encode", source_bytes=part.source_bytes, part_bytes=end, **seconds)
+        return found
+
+    def _over_frames(self, name: str, label: str, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Return what a task returns for every frame."""
+        pending = [self.stages.engine.submit(function, self.source, *batch, *arguments) for batch in self.batches]
+        sizes = [stop - start for start, stop in self.batches]
+        return [each for batch in self.stages.run(name, label, pending, sizes) for each in batch]
+
+    def _key(self) -> str:
+        """Return a digest of everything that the bytes of parts, and what was checked, follow from."""
+        versions, able = tasks.fingerprint()
+        described = {
+            "versions": versions,
+            "processor": able,
+            "frames": list(zip(self.source.files, self.identities, strict=True)),
+            "choices": repr(self.choices),
+            "options": repr(self.options),
+            "checks": None if self.checks is None else asdict(self.checks),
+        }
+        return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
+
+
+def _times_of(source: tasks.FrameSource, frame_times: Any) -> GaussianSequence:
+    """Return a sequence that has the right times; its frames are not asked for."""
+    count = len(source.files)
+    if frame_times is not None and len(frame_times) != count:
+        raise CapabilityError(f"frame_times needs one time a frame, {count}, and has {len(frame_times)}")
+    return GaussianSequence(
+        source.load, num_splats=source.first.splats, sh_degree=source.first.sh_degree, frame_times=frame_times, num_frames=count
+    )
+
+
+def _check_alike(engine: Engine) -> None:
+    """Refuse workers whose versions would give other bytes, and warn of unlike processors."""
+    if not isinstance(engine, Dask):
+        return
+    own, _ = tasks.fingerprint()
+    found = engine.run_everywhere(tasks.fingerprint)
+    for versions, _ in found:
+        unlike = [f"{name} {versions[name]} instead of {own[name]}" for name in own if versions[name] != own[name]]
+        if unlike:
+            raise ClusterError(f"a worker has {', '.join(unlike)}: install the same versions everywhere")
+    if len({able for _, able in found}) > 1:
+        message = "the workers have unlike processors, whose roundings may differ: bytes may depend on who encodes what"
+        warnings.warn(GsplatWarning(message, code="unlike-workers"), stacklevel=3)
+
+
+def _checks(model: tuple[str, str | None], num_frames: int, validation: Validation | None) -> Checks | None:
+    """Return how segments are checked."""
+    if validation is None:
+        return None
+    rendered = np.linspace(0, num_frames - 1, VALIDATED_FRAMES).round().astype(int).tolist()
+    chosen = model if validation.model is None else (validation.model, None)
+    return Checks(frames=tuple(sorted(set(rendered))), views=validation.views, size=validation.size, model=chosen)
+
+
+def _judge(found: list[Part], validation: Validation | None, model: tuple[str, str | None]) -> dict[str, Any] | None:
+    """Return what the checks of all segments say together."""
+    if validation is None:
+        return None
+    result: dict[str, Any] = {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None}
+    views = [view for part in found for view in part.views]
+    if views:
+        name, variant = model if validation.model is None else (validation.model, None)
+        report = summarize_views(views, name if variant is None else f"{name} {variant}", 0)
+        result = {each: getattr(report, each) for each in ("psnr_min", "psnr_mean", "ssim_mean", "max_abs", "identical")}
+        result |= {"worst_view": report.worst_view, "model": report.model}
+    level = result["psnr_min"]
+    if validation.min_psnr is not None and level is not None and level < validation.min_psnr:
+        raise ValidationError(
+            f"the worst view has {level:.2f} dB, below --min-psnr {validation.min_psnr:g}; the target is left as it was. "
+            "Use --preset best or a lower --min-psnr"
+        )
+    tally = merged_tally([part.tally for part in found if part.tally is not None])
+    return {**result, "attributes": tally.to_json(), "passed": True}
+
+
+class _Hashed:
+    """A stream that is written from start to end, and its SHA-256."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self.digest = hashlib.sha256()
+        self.size = 0
+
+    def seekable(self) -> bool:
+        return False
+
+    def tell(self) -> int:
+        return self.size
+
+    def write(self, data: bytes) -> int:
+        self._stream.write(data)
+        self.digest.update(data)
+        self.size += len(data)
+        return len(data)
+
+    def flush(self) -> None:
+        pass
+
+
+def _assemble(
+    target: Path, found: list[Part], entries: dict[str, bytes], shared: Shared, *, overwrite: bool, stages: _Stages
+) -> tuple[int, str]:
+    """Write the bundle from its parts, in the order of frames, and publish it; return its size and SHA-256."""
+    start = time.perf_counter()
+    with stage("writing", len(found), "segments") as progress, _opened(target, overwrite=overwrite) as stream:
+        hashed = _Hashed(stream)
+        archive = ZipWriter(hashed)  # type: ignore[arg-type] # all that is needed of a stream
+        for part in found:
+            images = [entry for entry in part.entries if entry.name.startswith("frames/")]
+            archive.graft(images, _moved(part, 0, part.images))
+            progress.advance(1)
+        deltas = {name: part for part in found for name in part.deltas}
+        for name in sorted([*entries, *deltas]):
+            if name in entries:
+                _add(archive, name, entries[name], shared)
+            else:
+                part = deltas[name]
+                offset, size = part.deltas[name]
+                own = [entry for entry in part.entries if entry.name == name]
+                archive.graft(own, _moved(part, offset, size), start=offset)
+        archive.close()
+        size = hashed.size
+    stages.note("assemble", seconds=time.perf_counter() - start, bytes=size)
+    return size, hashed.digest.hexdigest()
+
+
+def _moved(part: Part, start: int, size: int) -> Iterator[bytes]:
+    """Yield bytes of a part, saying what to do where it went missing."""
+    try:
+        yield from part_bytes(part.path, start, size)
+    except FileNotFoundError as error:
+        message = "a finished segment is gone; is the folder of parts one that all workers and this machine share? See --parts"
+        raise ClusterError(message, path=part.path) from error
+
+
+def _add(archive: ZipWriter, name: str, data: bytes, shared: Shared) -> None:
+    """Append an entry without seeking: made in memory, then moved."""
+    import io
+
+    alone = io.BytesIO()
+    writer = ZipWriter(alone)
+    writer.add(name, data, data_compression(shared.options))
+    archive.graft(writer.entries, [alone.getvalue()[: writer.size]])
+
+
+def _opened(target: Path, *, overwrite: bool) -> AbstractContextManager[Any]:
+    """Open what takes the place of the target when it is whole."""
+    if is_url(target):
+        return replacing_object(target, overwrite=overwrite, block_bytes=LARGE_BLOCK_BYTES)
+    return replacing(target, overwrite=overwrite)
+
+
+def _check_published(target: Path, num_splats: int, num_frames: int, bands: int) -> None:
+    """Hold the header of the bundle against what it was made from."""
+    expected = GaussianSequence(_no_frame, num_splats=num_splats, sh_degree=bands, num_frames=num_frames)
+    with target.open("rb") as stream:
+        check_header(stream, tasks.FORMAT, expected)
+
+
+def _no_frame(_frame_id: int) -> Any:
+    raise AssertionError("a header needs no frame")
+
+
+def _beside(target: Path) -> str:
+    """Return the folder of parts of a target."""
+    if is_url(target):
+        folder, _, name = url_of(target).rpartition("/")
+        return f"{folder}/.{name}{PARTS_SUFFIX}"
+    whole = target.absolute()
+    return str(whole.with_name(f".{whole.name}{PARTS_SUFFIX}"))
+
+
+def _remove_parts(folder: str) -> None:
+    """Remove parts that are no longer needed; what cannot be removed only takes room."""
+    try:
+        if is_url(folder):
+            remove(folder)
+            return
+        for path in Path(folder).glob("*.part"):
+            path.unlink()
+        with suppress(OSError):
+            Path(folder).rmdir()
+    except (OSError, WriteError) as error:
+        warnings.warn(GsplatWarning(f"finished segments could not be removed: {error}", code="parts-left"), stacklevel=3)
