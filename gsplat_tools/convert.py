@@ -140,7 +140,8 @@ def convert(
         try:
             outcome["validation"] = verify(Path(stream.name), prepared.scene, written, validation, outcome.get("bench"))
         except GsplatError as error:
-            error.path = Path(target)  # not the temporary file that was read back
+            if error.path is None or Path(error.path) == Path(stream.name):  # otherwise the source, which is read once more
+                error.path = Path(target)
             raise
         seconds["validate"] = time.perf_counter() - start
 
@@ -152,6 +153,8 @@ def convert(
         with opening as (opened, source_format):
             scene, retimed = retime(opened, record, motion, time_at, frame, interpolation, options)
             source_degree = scene.sh_degree
+            if options.get("clip") == "rendered":
+                options["clip"] = rendered_clip(scene, options)
             if budget is not None or (auto and preset != EXACT_PRESET):
                 how = _demanding(validation, budget)
                 validation = None if validation is None else how
@@ -159,8 +162,6 @@ def convert(
                 scene, options = tuned.scene, {**options, **tuned.options}
                 outcome |= {"bench": tuned.bench, "decisions": tuned.decisions, "search": tuned.found and tuned.found.to_json()}
             seconds["read"] = time.perf_counter() - start
-            if options.get("clip") == "rendered":
-                options["clip"] = rendered_clip(scene, options)
             saved = save(
                 scene,
                 target,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Literal
 
 import numpy as np
@@ -96,6 +97,28 @@ class GaussianSequence:
             frame_times=None if self.is_uniform else self.frame_times,
             num_frames=len(self),
             load_bounds=self._load_bounds,
+        )
+
+    def within(self, context: Callable[[], AbstractContextManager[None]]) -> GaussianSequence:
+        """Return these frames, each loaded inside what `context` returns, such as one that names the file in errors."""
+        load_bounds = self._load_bounds
+
+        def frame(frame_id: int) -> GaussianCloud:
+            with context():
+                return self.frame(frame_id)
+
+        def bounds() -> Bounds | None:
+            assert load_bounds is not None
+            with context():
+                return load_bounds()
+
+        return GaussianSequence(
+            frame,
+            num_splats=self.num_splats,
+            sh_degree=self.sh_degree,
+            frame_times=None if self.is_uniform else self.frame_times,
+            num_frames=len(self),
+            load_bounds=None if load_bounds is None else bounds,
         )
 
     def bracket(self, t: float) -> tuple[int, int, float]:

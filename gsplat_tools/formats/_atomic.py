@@ -73,17 +73,20 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
 @contextmanager
 def temporary_beside(target: Path) -> Iterator[BinaryIO]:
     """Open a temporary file in the folder of a target, that is gone when the block ends."""
-    with _explained(target):
-        raw = _create_temporary(target)
-    stream = io.BufferedRandom(raw, _BUFFER_BYTES)
+    names: list[Path] = []  # before there is a file: a signal may end the process between any two lines
+    stream: io.BufferedRandom | None = None
     try:
+        with _explained(target):
+            stream = io.BufferedRandom(_create_temporary(target, names), _BUFFER_BYTES)
         yield stream
     finally:
         # What could not be written stays in the buffer, and closing tries once more.
         with suppress(OSError, ValueError):
-            stream.close()
-        with suppress(OSError):
-            Path(raw.name).unlink(missing_ok=True)
+            if stream is not None:
+                stream.close()
+        for name in names:
+            with suppress(OSError):
+                name.unlink(missing_ok=True)
 
 
 def read_back(stream: BinaryIO, path: Path) -> None:
@@ -111,11 +114,12 @@ def read_back(stream: BinaryIO, path: Path) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other writers that ask for it out of a folder, where there are locks."""
-    if os.name != "posix":
+    """Keep other writers that ask for it out of a folder, where there are locks and the folder may be read."""
+    if os.name != "posix" or not os.access(folder, os.R_OK):
         yield
         return
-    handle = os.open(folder, os.O_RDONLY)
+    with _explained(folder):
+        handle = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -217,15 +221,17 @@ def _stem(path: Path) -> str:
     return path.name if len(encoded) <= _MAX_STEM_BYTES else hashlib.sha256(encoded).hexdigest()
 
 
-def _create_temporary(target: Path) -> RecordedFile:
-    """Make a temporary file beside the target, locked as long as it is open."""
+def _create_temporary(target: Path, names: list[Path]) -> RecordedFile:
+    """Make a temporary file beside the target, locked as long as it is open, and add its name to what is to be removed."""
     # Never more open than the target; a new one gets what any new file gets.
     mode = 0o600 if target.exists() else 0o666
     while True:
-        name = f".{_stem(target)}.{os.getpid()}.{secrets.token_hex(4)}{_SUFFIX}"
+        name = target.parent / f".{_stem(target)}.{os.getpid()}.{secrets.token_hex(4)}{_SUFFIX}"
+        names.append(name)
         try:
-            raw = RecordedFile(target.parent / name, mode, target)
+            raw = RecordedFile(name, mode, target)
         except FileExistsError:
+            names.remove(name)
             continue
         if os.name != "posix":
             return raw

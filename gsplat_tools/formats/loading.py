@@ -156,6 +156,7 @@ def load(path: str | Path, *, strict: bool = False, **options: Any) -> GaussianC
             stream.close()
             raise
         if isinstance(scene, GaussianSequence):
+            scene = scene.within(partial(located, path))
             weakref.finalize(scene, stream.close)  # its frames are read later
             return scene
         stream.close()
@@ -220,6 +221,8 @@ def open_scene(
             scene = with_source_format(reader(stream, checked), record)
             if isinstance(scene, CloudChunks):
                 scene = replace(scene, iterate=partial(_located_chunks, path, scene.iterate))
+            elif isinstance(scene, GaussianSequence):
+                scene = scene.within(partial(located, path))
             yield scene
 
 
