@@ -6,12 +6,12 @@ import itertools
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from gsplat_tools.cluster.outcomes import Outcome, is_passing, run_task
 from gsplat_tools.errors import CapabilityError, ClusterError, MissingDependencyError
@@ -24,10 +24,6 @@ _FIRST_PAUSE = 0.2
 """Seconds before a task is tried again in a process of this machine; doubled each time."""
 
 LOST = "the same command continues: segments and scenes that are finished are kept"
-
-
-class Pending(Protocol):
-    """A task that was handed in."""
 
 
 class Engine(Protocol):
@@ -43,6 +39,9 @@ class Engine(Protocol):
 
     def results(self, pending: Sequence[Any]) -> Iterator[Outcome]:
         """Yield outcomes in the order of the tasks."""
+
+    def completed(self, pending: Sequence[Any]) -> Iterator[tuple[int, Outcome | Exception]]:
+        """Yield (index of the task, outcome or error) as they end; one that fails stops no other."""
 
     def close(self) -> None:
         """Let go of the workers."""
@@ -76,6 +75,11 @@ class InProcess:
         """Run the tasks."""
         for task in pending:
             yield self._outcome(task)
+
+    def completed(self, pending: Sequence[_Task]) -> Iterator[tuple[int, Outcome | Exception]]:
+        """Run the tasks."""
+        for index, task in enumerate(pending):
+            yield index, _caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
 
     def close(self) -> None:
         """Nothing is held."""
@@ -123,6 +127,19 @@ class Processes:
         for task in pending:
             yield self._outcome(task)
 
+    def completed(self, pending: Sequence[_Task]) -> Iterator[tuple[int, Outcome | Exception]]:
+        """Wait for the tasks as they end."""
+        left = dict(enumerate(pending))
+        while left:
+            futures = [task.future for task in left.values() if task.future is not None]
+            wait(futures, return_when=FIRST_COMPLETED)
+            ended = [index for index, task in left.items() if task.future is not None and task.future.done()]
+            for index in ended:
+                task = left[index]
+                if task.future is not None and task.future.done():  # not handed in again meanwhile
+                    yield index, _caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
+                    del left[index]
+
     def close(self) -> None:
         """End the processes."""
         self._pool.shutdown(wait=False, cancel_futures=True)
@@ -140,13 +157,25 @@ class Processes:
     def _restart(self, task: _Task) -> None:
         """Replace the processes after one died, and hand in again what they had not finished."""
         task.tries += 1
-        if task.tries > self._retries:
-            raise ClusterError(f"a task ended its process {task.tries} times, for want of memory most likely; {LOST}")
         self.retried += 1
         self._pool.shutdown(wait=False, cancel_futures=True)
+        if task.tries > self._retries:
+            self._run_alone(task)
         self._start()
         for each in self._unfinished:
             each.future = self._pool.submit(run_task, each.function, self._jobs, *each.arguments)
+
+    def _run_alone(self, task: _Task) -> None:
+        """Run a task in a process of its own, to tell whether it is this one that ends processes."""
+        self._unfinished.remove(task)
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            try:
+                task.outcome = pool.submit(run_task, task.function, self._jobs, *task.arguments).result()
+            except BrokenProcessPool as error:
+                task.outcome = Outcome(
+                    error=ClusterError(f"the task ended its process {task.tries + 1} times, for want of memory most likely")
+                )
+                task.outcome.error.__cause__ = error  # type: ignore[union-attr]
 
     def _outcome(self, task: _Task) -> Outcome:
         while task.outcome is None:
@@ -156,9 +185,12 @@ class Processes:
                 self._unfinished.remove(task)
             except BrokenProcessPool:
                 self._restart(task)
+            except CancelledError:
+                self._send(task)
             except Exception as error:
                 task.tries += 1
                 if task.tries > self._retries or not is_passing(error):
+                    self._unfinished.remove(task)
                     raise
                 self.retried += 1
                 time.sleep(_FIRST_PAUSE * 2**task.tries)
@@ -221,6 +253,19 @@ class Dask:
                 self._client.cancel(list(pending), force=True)
             raise
 
+    def completed(self, pending: Sequence[Any]) -> Iterator[tuple[int, Outcome | Exception]]:
+        """Wait for the tasks as they end."""
+        if not pending:
+            return
+        places = {future.key: index for index, future in enumerate(pending)}
+
+        def outcome(future: Any) -> Outcome:
+            with self._explained():
+                return cast("Outcome", future.result())
+
+        for future in self._distributed.as_completed(pending):
+            yield places[future.key], _caught(lambda future=future: outcome(future))  # type: ignore[misc]
+
     def run_everywhere(self, function: Callable[[], Any]) -> list[Any]:
         """Return what a function returns on every worker."""
         with self._explained():
@@ -238,7 +283,6 @@ class Dask:
     def _explained(self) -> Iterator[None]:
         """Turn what Dask raises about workers and connections into our error."""
         from asyncio import CancelledError as Cancelled
-        from concurrent.futures import CancelledError
 
         lost = (
             CancelledError,
@@ -252,6 +296,14 @@ class Dask:
             raise ClusterError(f"a task ended its workers again and again, for want of memory most likely; {LOST}") from error
         except lost as error:
             raise ClusterError(f"the connection to the scheduler at {self.name} was lost; {LOST}") from error
+
+
+def _caught(function: Callable[[], Outcome]) -> Outcome | Exception:
+    """Return what a function returns, or the exception that it raises."""
+    try:
+        return function()
+    except Exception as error:
+        return error
 
 
 _numbers = itertools.count()
