@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,12 @@ from gsplat_tools.formats.knobs import ATTRIBUTES, Knob, Stream
 from gsplat_tools.tuning.streams import Option, StreamModel
 from gsplat_tools.tuning.trials import Errors, Trials, level
 
-_MAX_ELEMENTS = 1 << 23
-"""Errors that are compared at once: combinations times pictures."""
+_MAX_ELEMENTS = 1 << 19
+"""Errors that are compared at once: combinations times pictures. Where there are more, some options of each stream are
+combined first, and then all of them, two streams at a time."""
+_FEWEST = 5
+"""Options of a stream that are combined at least."""
+_SWEEPS = 4
 _FACTORS = ("splats", "codes", "container")
 
 
@@ -142,11 +147,34 @@ class RateModel:
         """
         table = self.table()
         kept = [_undominated(sizes, errors) for sizes, errors in table]
+        wanted = None if min_level is None else 10 ** (-min_level / 10)
         count = int(np.prod([len(each) for each in kept]))
         most = _MAX_ELEMENTS // len(self._fixed.errors)
-        if count > most:
-            share = (most / count) ** (1 / max(1, sum(len(each) > 8 for each in kept)))
-            kept = [_thinned(each, max(8, int(len(each) * share))) for each in kept]
+        if count <= most:
+            return self._best(table, kept, wanted, max_bytes, scale)
+        share = (most / count) ** (1 / max(1, sum(len(each) > _FEWEST for each in kept)))
+        choice = self._best(
+            table, [_thinned(each, max(_FEWEST, int(len(each) * share))) for each in kept], wanted, max_bytes, scale
+        )
+        for _ in range(_SWEEPS):
+            before = choice
+            for pair in combinations(range(len(kept)), 2):
+                if choice is not None:  # one of what the pair is chosen from, so that there always is one
+                    rows = [kept[axis] if axis in pair else np.array([place]) for axis, place in enumerate(choice.places)]
+                    choice = self._best(table, rows, wanted, max_bytes, scale)
+            if choice is None or before is None or choice.places == before.places:
+                break
+        return choice
+
+    def _best(
+        self,
+        table: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+        kept: Sequence[NDArray[np.intp]],
+        wanted: float | None,
+        max_bytes: float,
+        scale: Errors | float,
+    ) -> Choice | None:
+        """Return the best combination of some options of every stream; `wanted` is the largest squared error."""
         shape = tuple(len(each) for each in kept)
         sizes = np.full(shape, float(self._fixed.bytes))
         errors = np.zeros((*shape, len(self._fixed.errors))) + self._fixed.errors
@@ -161,8 +189,8 @@ class RateModel:
             errors = errors + own_errors[rows].reshape(*along, -1)
         sizes = (sizes * factor).ravel()
         worst = np.maximum((errors * scale).max(axis=-1), 0).ravel()
-        if min_level is not None:
-            fits = (worst <= 10 ** (-min_level / 10)) & (sizes <= max_bytes)
+        if wanted is not None:
+            fits = (worst <= wanted) & (sizes <= max_bytes)
             key = sizes
         else:
             fits = sizes <= max_bytes
@@ -183,7 +211,8 @@ class RateModel:
                 return None
             guessed = [
                 (stream, place)
-                for stream, place in zip(self.streams, choice.places, strict=True)
+                for stream, chosen in zip(self.streams, choice.places, strict=True)
+                for place in _looked_at(stream, chosen)
                 if not stream.is_measured(place)
             ]
             if not guessed:
@@ -223,6 +252,12 @@ def _base(stream: StreamModel) -> Option:
     if stream.name == "container":
         return stream.options[0]
     return stream.anchor() if stream.name in {"sh", "scales"} else stream.options[-1]
+
+
+def _looked_at(stream: StreamModel, place: int) -> list[int]:
+    """Return the options to measure for a choice: some beside it too where that needs a picture and no encoding."""
+    beside = (0,) if stream.name != "splats" else (-4, -1, 0, 1, 4)
+    return [place + step for step in beside if 0 <= place + step < len(stream.options)]
 
 
 def _undominated(sizes: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray[np.intp]:

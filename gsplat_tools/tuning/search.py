@@ -24,18 +24,24 @@ from gsplat_tools.tuning.trials import Trial, Trials, level
 TARGET_VIEWS, TARGET_SIZE = 8, (640, 360)
 """Views that a PSNR target is held at where none are asked for: those of `compare`."""
 
-SEARCH_SPLATS = 1 << 17
-"""Larger scenes are searched on a ball of so many splats around their middle, and verified whole."""
+SEARCH_SPLATS = 1 << 16
+"""Scenes a quarter larger are searched on a ball of so many splats around their middle, and verified whole."""
 SEARCH_FRAMES = 3
 """Frames at the start of a sequence that stand for it while searching."""
 
 _ROUNDS = 7
 _STEP = 0.1
 """What is asked for beyond the budget after a choice came up again, dB or tenths of the logarithm of the bytes."""
+_REPEATS = 20
+"""How often more is asked for until something new comes up."""
 
-_LOOSE = 0.5
-"""dB above the target from which the presets are tried as well, since the prediction does not fit the scene."""
+_LARGE = 1 << 16
+"""Splats from which fewer rounds are made, and presets finer than one that is larger already are not tried."""
+_LARGE_ROUNDS = 4
+_STEPS = 4
+"""Coarser values of a knob that are tried on top of a preset."""
 
+_EXACT = "exact"
 _TINY = 1e-12
 _CLOSE = 0.1
 """dB above the target, or share of the bytes below the budget, from which looking further is not worth its time."""
@@ -189,13 +195,21 @@ class Searcher:
                 knobs = turnable(self._scene, self.whole.record, self.whole.fixed, keep_splats=keeps_splats)
                 self._rates[keeps_splats] = RateModel(self._part, knobs)
             hunt = _Hunt(self.whole, self._rates[keeps_splats], budget, _count(self._scene))
-            found = hunt.run(progress.advance)
-            options = hunt.presets(found[1])
-            report = hunt.report(found, time.perf_counter() - start)
-            if not options:
-                return report
-            trial = self.whole.encode(options)
-            return replace(report, options=options, bytes=trial.bytes, psnr_min=trial.level, decisions=[])
+            try:
+                found = hunt.run(progress.advance)
+            except ValidationError:
+                preset = hunt.preset(None)
+                if preset is None:
+                    raise
+                report = Found(options={}, bytes=0, psnr_min=0.0)
+            else:
+                preset = hunt.preset(found[1])
+                report = hunt.report(found)
+            if preset is not None:
+                options, trial, why = preset
+                decision = {"stream": why, "options": options, "bytes": None, "db": None, "next_bytes": None, "next_db": None}
+                report = replace(report, options=options, bytes=trial.bytes, psnr_min=trial.level, decisions=[decision])
+            return replace(report, trials=self.whole.count, seconds=time.perf_counter() - start)
 
 
 def turnable(
@@ -236,14 +250,20 @@ class _Hunt:
         self._whole, self._rates, self._budget = whole, rates, budget
         self._max_bytes = budget.bytes_for(splats)
         self._ratio, self._scale = 1.0, np.ones(1)
+        self._is_large = splats > _LARGE
         self._verified: dict[tuple[int, ...], tuple[Choice, Trial]] = {}
 
     def run(self, advance: Callable[[int], None]) -> tuple[Choice, Trial]:
         """Return the best choice that holds."""
         best: tuple[Choice, Trial] | None = None
         margin = 0.0
-        for _ in range(_ROUNDS):
+        for _ in range(_LARGE_ROUNDS if self._is_large else _ROUNDS):
             choice = self._propose(margin)
+            for _ in range(_REPEATS):
+                if choice is None or choice.places not in self._verified or (best and choice.places == best[0].places):
+                    break
+                margin += _STEP
+                choice = self._propose(margin)
             if choice is None:
                 if best is not None:
                     break
@@ -251,10 +271,7 @@ class _Hunt:
                 advance(1)
                 continue
             if choice.places in self._verified:
-                if best is not None and choice.places == best[0].places and margin == 0:
-                    break
-                margin += _STEP
-                continue
+                break
             trial = self._verify(choice)
             advance(1)
             if self._holds(trial) and (best is None or self._is_better(trial, best[1])):
@@ -263,21 +280,48 @@ class _Hunt:
                     break
         return best or self._extreme()
 
-    def presets(self, best: Trial) -> dict[str, Any]:
-        """Return the options of a preset that holds the budget and does better, or nothing."""
-        wanted = self._budget.min_psnr
-        if wanted is None or best.level < wanted + _LOOSE:
-            return {}
-        chosen: dict[str, Any] = {}
-        for changes in self._whole.record.presets.values():
-            options = {name: value for name, value in changes.items() if name not in self._whole.fixed}
-            try:
-                trial = self._whole.encode(options)
-            except GsplatError:
+    def preset(self, best: Trial | None) -> tuple[dict[str, Any], Trial, str] | None:
+        """Return the smallest preset that holds a PSNR in no more bytes than what was found, a step coarser where one holds.
+
+        Presets are encoded in their order; only one that is no larger is drawn.
+        """
+        if self._budget.min_psnr is None:
+            return None
+        limit = np.inf if best is None else best.bytes
+        chosen: tuple[dict[str, Any], Trial, str] | None = None
+        for name, changes in self._whole.record.presets.items():
+            options = {option: value for option, value in changes.items() if option not in self._whole.fixed}
+            trial = None if name == _EXACT else self._try(options, limit)
+            if trial is None:
                 continue
-            if self._holds(trial) and self._is_better(trial, best):
-                chosen, best = options, trial
-        return chosen
+            if trial.bytes <= limit and self._holds(trial):
+                chosen, limit = (options, trial, f"preset {name}"), trial.bytes
+            if self._is_large and trial.bytes > limit:
+                break
+        return None if chosen is None else self._coarser(*chosen)
+
+    def _try(self, options: dict[str, Any], limit: float) -> Trial | None:
+        """Encode the whole scene, and draw it if it is no larger than a limit; None where the format cannot hold it."""
+        try:
+            return self._whole.encode(options, limit=limit)
+        except GsplatError:
+            return None
+
+    def _coarser(self, options: dict[str, Any], trial: Trial, why: str) -> tuple[dict[str, Any], Trial, str]:
+        """Return options with packing, splats, and codes a step or more coarser than a preset's, while they hold."""
+        for stream in self._rates.streams:
+            if stream.name not in {"container", "splats", "codes"}:
+                continue
+            for name, knob in stream.knobs.items():
+                finest_first = [value for value in reversed(knob.values) if value != options.get(name, 0)]
+                for value in finest_first[:_STEPS]:
+                    changed = {**options, name: value}
+                    found = self._try(changed, trial.bytes - 1)
+                    if found is not None and found.bytes < trial.bytes and self._holds(found):
+                        options, trial = changed, found
+                    elif stream.name != "container":
+                        break
+        return options, trial, why
 
     def _propose(self, margin: float) -> Choice | None:
         """Return the best choice by the corrected prediction, a little better than the budget asks for."""
@@ -357,7 +401,7 @@ class _Hunt:
             self._verify(choice)
         return min((t for _, t in self._verified.values() if t.level >= wanted), key=lambda trial: trial.bytes)
 
-    def report(self, found: tuple[Choice, Trial], seconds: float) -> Found:
+    def report(self, found: tuple[Choice, Trial]) -> Found:
         """Return what was found, with the prices of a little more."""
         choice, trial = found
         self._correct(choice, trial)
@@ -379,8 +423,6 @@ class _Hunt:
             decisions=decisions,
             next_db_bytes=self._price("bytes", "db", choice, dearer)["bytes"],
             next_megabyte_db=self._price("bytes", "db", choice, richer)["db"],
-            trials=len(self._verified),
-            seconds=seconds,
         )
 
     def _price(self, bytes_name: str, db_name: str, coarse: Choice | None, fine: Choice | None) -> dict[str, float | None]:
@@ -399,7 +441,7 @@ def _part(scene: GaussianCloud | GaussianSequence) -> GaussianCloud | GaussianSe
     from gsplat_tools.ops.sampling import crop
 
     if isinstance(scene, GaussianCloud):
-        return crop(scene, SEARCH_SPLATS) if len(scene) > 1.5 * SEARCH_SPLATS else scene
+        return crop(scene, SEARCH_SPLATS) if len(scene) > 1.25 * SEARCH_SPLATS else scene
     frames = [scene.frame(frame_id) for frame_id in range(min(SEARCH_FRAMES, len(scene)))]
     return GaussianSequence(frames.__getitem__, num_splats=scene.num_splats, sh_degree=scene.sh_degree, num_frames=len(frames))
 

@@ -68,7 +68,19 @@ class Trials:
         self.bench, self.record, self.preset, self.fixed = bench, record, preset, dict(fixed)
         self._known: dict[tuple[Any, ...], Trial] = {}
 
-    def encode(self, options: Mapping[str, Any], attributes: Sequence[str] | None = None, *, draw: bool = True) -> Trial:
+    @property
+    def count(self) -> int:
+        """How many encodings and drawings there were."""
+        return len(self._known)
+
+    def encode(
+        self,
+        options: Mapping[str, Any],
+        attributes: Sequence[str] | None = None,
+        *,
+        draw: bool = True,
+        limit: float = np.inf,
+    ) -> Trial:
         """Write the scene, read it back and draw it.
 
         Parameters
@@ -79,16 +91,23 @@ class Trials:
             Arrays that are taken from the file, the others being those that were given to the writer; by default all.
         draw
             Whether pictures are made.
+        limit
+            Bytes of a file above which no pictures are made.
 
         Raises
         ------
         GsplatError
             The format cannot hold the scene with these options.
         """
-        key = (*sorted(options.items()), ("attributes", attributes and tuple(attributes)), ("draw", draw))
-        if key not in self._known:
-            self._known[key] = self._encode({**self.fixed, **options}, attributes, draw)
-        return self._known[key]
+        key = (*sorted(options.items()), ("attributes", attributes and tuple(attributes)))
+        known = self._known.get((*key, True), None if draw else self._known.get((*key, False)))
+        if known is None:
+            undrawn = self._known.get((*key, False))
+            if undrawn is not None and undrawn.bytes > limit:
+                return undrawn
+            known = self._encode({**self.fixed, **options}, attributes, limit if draw else -1)
+            self._known[*key, bool(known.errors.size)] = known
+        return known
 
     def prepare(self, options: Mapping[str, Any]) -> Trial:
         """Draw what would be given to the writer; no bytes are known."""
@@ -102,7 +121,7 @@ class Trials:
             self._known[key] = Trial(0, count_splats(prepared), self._draw(frames, frames[0].coordinate_system))
         return self._known[key]
 
-    def _encode(self, options: dict[str, Any], attributes: Sequence[str] | None, draw: bool) -> Trial:
+    def _encode(self, options: dict[str, Any], attributes: Sequence[str] | None, limit: float) -> Trial:
         given = list[Scene]()
 
         def remember(_stream: BinaryIO, prepared: Prepared, _record: Format) -> None:
@@ -112,7 +131,7 @@ class Trials:
             warnings.simplefilter("ignore")
             path = Path(folder) / f"trial{self.record.extensions[0]}"
             report = save(self.bench.scene, path, to=self.record.id, preset=self.preset, check=remember, **options)
-            if not draw:
+            if report.bytes > limit:
                 return Trial(report.bytes, report.splats, np.zeros(0))
             with open_scene(path, in_chunks=False, as_format=self.record.id) as decoded:
                 read = _frames(decoded)
