@@ -67,3 +67,13 @@ def test_search__needs_validation_and_is_not_estimated(scene: Path, tmp_path: Pa
 def test_documents__hold_the_table_that_help_prints() -> None:
     assert knob_table() in (ROOT / "docs" / "tuning.md").read_text(encoding="utf-8")
     assert run("--show-knobs").stdout.strip() == knob_table()
+
+
+@pytest.mark.parametrize("options", [["--dry-run"], ["--max-bytes", 10**6, "--views", 1], ["--auto", "--views", 1]], ids=str)
+def test_clip_by_rendering__comes_before_estimates_and_searches(options: list[object], scene: Path, tmp_path: Path) -> None:
+    result = run(scene, tmp_path / "a.vis", "--to", "visionary-i8", "--clip", "rendered", *options, "--json", "--quiet")
+
+    assert result.exit_code == 0
+    report = json.loads(result.stdout)
+    assert (report["bytes"] if "--dry-run" in options else report["target"]["bytes"]) > 17 * 300
+    assert report.get("options", {}).get("clip") != "rendered"

@@ -162,7 +162,7 @@ def test_splats_of_the_sidecar__must_fit_the_size(tmp_path: Path) -> None:
     place = tmp_path / "a.vis.json"
     place.write_text(json.dumps(json.loads(place.read_text()) | {"splats": 8}))
 
-    with pytest.raises(TruncatedDataError, match="bytes a splat"):
+    with pytest.raises(TruncatedDataError, match="232 bytes a splat, and 8 splats by the sidecar, found 1624 bytes"):
         load(path)
 
 
@@ -316,3 +316,13 @@ def test_convert__chooses_int8_ranges_by_rendering(tmp_path: Path) -> None:
     report = convert([tmp_path / "a.ply"], tmp_path / "a.vis", to="visionary-i8", clip="rendered")
 
     assert report.options["clip"] in ("auto", 0.0, 1e-5, 1e-4, 1e-3, 1e-2)
+
+
+def test_convert__does_not_warn_of_model_params_that_it_was_asked_for(tmp_path: Path) -> None:
+    save(random_cloud(30, sh_degree=0), tmp_path / "a.ply")
+
+    report = convert([tmp_path / "a.ply"], tmp_path / "a.vis", to="visionary-f32", gaussian_scaling=2.0)
+    again = convert([tmp_path / "a.vis"], tmp_path / "b.ply")
+
+    assert report.warnings == []
+    assert [warning["code"] for warning in again.warnings] == ["model-params"]

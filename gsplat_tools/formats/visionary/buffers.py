@@ -83,7 +83,8 @@ def _layout(stream: BinaryIO, precision: Precision) -> tuple[Sidecar, int]:
     size = stream_size(stream)
     count = size // stride if sidecar.splats is None else sidecar.splats
     if size != count * stride or size == 0:
-        raise TruncatedDataError(f"expected {stride} bytes a splat, at least one of them, found {size} bytes", offset=size)
+        promised = "at least one" if sidecar.splats is None else f"and {sidecar.splats} splats by the sidecar"
+        raise TruncatedDataError(f"expected {stride} bytes a splat, {promised}, found {size} bytes", offset=size)
     check_splats(count, sidecar.sh_degree, None, field="splats")
     return sidecar, count
 
