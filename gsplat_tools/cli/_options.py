@@ -23,13 +23,15 @@ MODELS = ("inria", "unity", "spark", "visionary")
 # click's types take a parameter from 8.4 on only, and older versions serve as well.
 if TYPE_CHECKING:
     SizeBase = click.ParamType[tuple[int, int]]
-    DegreeBase = click.ParamType[int | str]
+    WordOrIntBase = click.ParamType[int | str]
     TimesBase = click.ParamType[list[float]]
     AxesBase = click.ParamType[str]
     FloatBase = click.ParamType[float]
+    ClipBase = click.ParamType[float | str]
     BytesBase = click.ParamType[int]
 else:
-    SizeBase = DegreeBase = TimesBase = AxesBase = FloatBase = BytesBase = click.ParamType
+    SizeBase = WordOrIntBase = TimesBase = AxesBase = click.ParamType
+    FloatBase = ClipBase = BytesBase = click.ParamType
 
 
 class AxesType(AxesBase):
@@ -81,7 +83,7 @@ class SizeType(SizeBase):
         return int(match[1]), int(match[2])
 
 
-class DegreeType(DegreeBase):
+class DegreeType(WordOrIntBase):
     """0 to 4, or auto."""
 
     name = "0..4|auto"
@@ -95,7 +97,7 @@ class DegreeType(DegreeBase):
         return int(value)
 
 
-class FractionalBitsType(click.ParamType[int | str]):
+class FractionalBitsType(WordOrIntBase):
     """0 to 23, auto or finest."""
 
     name = "0..23|auto|finest"
@@ -109,7 +111,7 @@ class FractionalBitsType(click.ParamType[int | str]):
         return int(value)
 
 
-class ClipType(click.ParamType[float | str]):
+class ClipType(ClipBase):
     """0 to below 0.5, auto or rendered."""
 
     name = "SHARE|auto|rendered"
@@ -127,7 +129,18 @@ class ClipType(click.ParamType[float | str]):
         return share
 
 
-class FramesType(click.ParamType[int | str]):
+class PositionBitsType(click.Choice):  # type: ignore[type-arg]
+    """8 or 16."""
+
+    def __init__(self) -> None:
+        super().__init__(["8", "16"])
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the bits."""
+        return int(super().convert(str(value), param, ctx))
+
+
+class FramesType(WordOrIntBase):
     """A number of frames, or auto."""
 
     name = "N|auto"

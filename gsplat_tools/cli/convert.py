@@ -9,12 +9,14 @@ from typing import Any
 
 import click
 
+from gsplat_tools.cli import _cluster as cluster
 from gsplat_tools.cli import _options as options
 from gsplat_tools.cli import _output as output
 from gsplat_tools.cli import _tuning as tuning
 from gsplat_tools.cli._errors import one_line, reports_errors
 from gsplat_tools.cli._help import SectionedCommand
 from gsplat_tools.errors import counts_in_words
+from gsplat_tools.formats._stores import local_path
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.preparing import SaveChoices
 from gsplat_tools.formats.registry import FORMATS
@@ -59,7 +61,7 @@ FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
         "help": "Share of values beyond the int8 ranges; auto: least error, rendered: best pictures.",
     }),
     ("--position-bits", "position_bits", {
-        "type": click.IntRange(8, 16), "help": "Bits of a coordinate in blocks of 256 splats, 8 or 16.",
+        "type": options.PositionBitsType(), "help": "Bits of a coordinate in blocks of 256 splats.",
     }),
     ("--kernel-size", "kernel_size", {"type": options.FiniteType(0), "help": "Low-pass filter in the sidecar, px^2."}),
     ("--gaussian-scaling", "gaussian_scaling", {"type": options.FiniteType(0), "help": "Factor of scales in the sidecar."}),
@@ -96,8 +98,8 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 
 
 @click.command(cls=SectionedCommand, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
-@click.argument("sources", nargs=-1, required=True, metavar="SOURCE...")
-@click.argument("target", type=click.Path(path_type=Path))
+@click.argument("sources", nargs=-1, metavar="SOURCE...")
+@click.argument("target", type=click.Path(path_type=Path), required=False, metavar="TARGET")
 @click.option(
     "--to",
     "formats",
@@ -188,11 +190,15 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 @options.json_option
 @click.option("--quiet", is_flag=True, help="Print errors only.")
 @options.progress_option
+@cluster.cluster_options
 @options.version_option
+@click.pass_context
 @reports_errors
 def main(
+    context: click.Context,
+    /,
     sources: tuple[str, ...],
-    target: Path,
+    target: Path | None,
     formats: tuple[str, ...],
     *,
     dry_run: bool,
@@ -220,28 +226,44 @@ def main(
     from gsplat_tools.estimation import estimate
     from gsplat_tools.parallel import use_jobs
 
+    where = cluster.where_of(given)
+    cluster.check_arguments(sources, target, where)
+    if dry_run and (where.batch is not None or where.scheduler != cluster.LOCAL):
+        raise click.UsageError("--dry-run estimates one conversion on this machine; leave out --batch and --scheduler")
+    if where.batch is not None:
+        with use_jobs(jobs), output.showing_progress(progress and not quiet):
+            cluster.run_manifest(context, where, jobs, _arguments, as_json=as_json, quiet=quiet)
+        return
+    assert target is not None
+    target = Path(local_path(target))
     for source in sources:
-        if not any(mark in source for mark in "*?[") and not Path(source).exists():
+        if cluster.is_missing(source):
             raise click.UsageError(f"source {source!r} does not exist")
     targets = _targets(sources, target, formats)
     arguments = _arguments(given, [find_target(path, to) for path, to in targets])
     if len(formats) == 1 and target.is_dir() and given["time_at"] is None and given["frame"] is None:
         targets, arguments = _every_frame(sources, targets[0], arguments[0])
-    reports = []
-    with use_jobs(jobs), output.showing_progress(progress and not quiet):
+    reports: list[dict[str, Any]] = []
+
+    def tell(report: dict[str, Any]) -> None:
+        reports.append(report)
+        if not quiet:
+            for warning in report["warnings"]:
+                click.echo(f"warning: {one_line(warning['message'])}", err=True)
+            if not as_json:
+                click.echo(_summary(report), err=True)
+
+    showing = output.showing_progress(progress and not quiet)
+    with use_jobs(jobs), showing, cluster.opened(where, jobs, quiet=quiet) as engine:
         for (path, to), own in zip(targets, arguments, strict=True):
             if dry_run:
                 reports.append(estimate(sources, path, to=to, **tuning.without_search(own)))
                 if not as_json:
                     click.echo(_estimated(reports[-1]))
-                continue
-            report = convert(sources, path, to=to, overwrite=overwrite, **own)
-            reports.append(report.to_json())
-            if not quiet:
-                for warning in report.warnings:
-                    click.echo(f"warning: {one_line(warning['message'])}", err=True)
-                if not as_json:
-                    click.echo(_summary(report.to_json()), err=True)
+            elif engine is None:
+                tell(convert(sources, path, to=to, overwrite=overwrite, **own).to_json())
+            else:
+                tell(cluster.convert_elsewhere(sources, path, to, engine, where, {**own, "overwrite": overwrite}))
     if as_json:
         output.print_json(reports[0] if len(reports) == 1 else {"conversions": reports})
 

@@ -5,10 +5,12 @@ import sys
 import time
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from gsplat_tools.cli import _options as options
 from gsplat_tools.cli.convert import main
 from gsplat_tools.formats import load, save
 from tests.clouds import random_cloud
@@ -299,3 +301,17 @@ def test_help__has_every_option_once_under_a_heading() -> None:
                 >= 1
             )
     assert text.count("--visual-tolerance") == 1
+
+
+def test_option_types__are_those_of_click_before_its_types_took_parameters() -> None:
+    types = [each for each in vars(options).values() if isinstance(each, type) and issubclass(each, click.ParamType)]
+
+    assert len(types) > 8
+    assert [each.__name__ for each in types if "__orig_bases__" in vars(each)] == []
+
+
+def test_position_bits__are_8_or_16(scene: Path, tmp_path: Path) -> None:
+    result = run(scene, tmp_path / "a.vis", "--to", "visionary-i8", "--position-bits", 9)
+
+    assert result.exit_code == 2
+    assert "'9' is not one of '8', '16'" in result.stderr
