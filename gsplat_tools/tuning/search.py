@@ -185,6 +185,7 @@ class Searcher:
         half = max(size[0] // 2, 1), max(size[1] // 2, 1)
         self._part = Trials(Workbench(_part(scene), views=views, size=half, model=model), record, preset, pinned)
         self._rates: dict[bool, RateModel] = {}
+        self.is_large = _count(scene) > _LARGE
 
     def find(self, budget: Budget) -> Found:
         """Return the best encoding within a budget; as `search`, with the same errors."""
