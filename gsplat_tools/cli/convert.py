@@ -227,9 +227,7 @@ def main(
     from gsplat_tools.parallel import use_jobs
 
     where = cluster.where_of(given)
-    cluster.check_arguments(sources, target, where)
-    if dry_run and (where.batch is not None or where.scheduler != cluster.LOCAL):
-        raise click.UsageError("--dry-run estimates one conversion on this machine; leave out --batch and --scheduler")
+    cluster.check_arguments(sources, target, where, dry_run=dry_run)
     if where.batch is not None:
         with use_jobs(jobs), output.showing_progress(progress and not quiet):
             cluster.run_manifest(context, where, jobs, _arguments, as_json=as_json, quiet=quiet)

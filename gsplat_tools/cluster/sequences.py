@@ -156,6 +156,8 @@ def convert_sequence(
         folder = parts or _beside(target)
         found = job.encode(fit, shared, folder)
         encoded = time.perf_counter()
+        busy = [sum(part.seconds.get(name, 0) for part in found) for name in ("validate", "read", "encode", "write")]
+        checking = busy[0] / (sum(busy) or 1)
         validated = _judge(found, validation, record.model)
         warn_again(stages.outcomes)
         facts = [part.facts for part in found]
@@ -180,9 +182,9 @@ def convert_sequence(
         warnings=unique_warnings(caught),
         seconds={
             "read": looked - start,
-            "encode": encoded - looked,
+            "encode": (encoded - looked) * (1 - checking),
             "write": time.perf_counter() - encoded,
-            "validate": sum(part.seconds.get("validate", 0) for part in found) / max(engine.workers, 1),
+            "validate": (encoded - looked) * checking,
         },
         validation=validated,
         options={name: getattr(write_options, name) for name in write_options.__dataclass_fields__},

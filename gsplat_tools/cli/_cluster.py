@@ -1,0 +1,237 @@
+"""Options and words for batches and clusters."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.core import ParameterSource
+
+from gsplat_tools.cli import _output as output
+from gsplat_tools.cli._errors import EXIT_DATA, one_line
+from gsplat_tools.errors import CapabilityError, GsplatError
+from gsplat_tools.formats._stores import is_url, local_path
+from gsplat_tools.formats.base import Format
+from gsplat_tools.formats.saving import find_target
+
+if TYPE_CHECKING:
+    from gsplat_tools.cluster.batches import Item
+    from gsplat_tools.cluster.engines import Engine
+    from gsplat_tools.cluster.manifest import Row
+
+LOCAL = "local"
+
+_OF_THE_COMMAND = (
+    "batch", "state", "resume", "scheduler", "retries", "parts", "jobs", "max_memory", "as_json", "quiet", "progress",
+    "dry_run", "version", "help", "show_knobs",
+)  # fmt: skip
+"""Parameters that a row of a manifest cannot have."""
+
+Arguments = Callable[[dict[str, Any], list[Format]], list[dict[str, Any]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """What the options say about batches and clusters."""
+
+    scheduler: str
+    batch: str | None
+    state: Path | None
+    resume: bool
+    retries: int
+    parts: str | None
+
+
+def cluster_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of batches and clusters."""
+    for option in reversed((
+        click.option(
+            "--scheduler", default=LOCAL, show_default=True, metavar="WHERE",
+            help="local: this process; local:N: N processes; local-cluster:N: Dask on this machine; tcp://HOST:PORT: a Dask "
+            "scheduler that is running. The bytes are the same.",
+        ),
+        click.option(
+            "--batch", metavar="MANIFEST",
+            help="Convert what a CSV file or JSON lines list (source, target, options); a scene that fails stops no other.",
+        ),
+        click.option(
+            "--resume", is_flag=True, help="Leave out what a batch has done, where source, options and target are as then."
+        ),
+        click.option(
+            "--state", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+            help="Where a batch notes what is done; by default MANIFEST.state.jsonl.",
+        ),
+        click.option(
+            "--retries", type=click.IntRange(min=0), default=3, show_default=True,
+            help="Times to try again after lost workers and errors of disks and stores.",
+        ),
+        click.option(
+            "--parts", metavar="DIR", help="Folder or URL for finished segments of a sequence; by default beside the target."
+        ),
+    )):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def where_of(given: dict[str, Any]) -> Where:
+    """Take the options of this module out of those that were given."""
+    return Where(**{name: given.pop(name) for name in Where.__dataclass_fields__})
+
+
+def check_arguments(sources: tuple[str, ...], target: Path | None, where: Where, *, dry_run: bool) -> None:
+    """Refuse what does not go together."""
+    if dry_run and (where.batch is not None or where.scheduler != LOCAL):
+        raise click.UsageError("--dry-run estimates one conversion on this machine; leave out --batch and --scheduler")
+    if where.batch is not None:
+        if sources or target is not None:
+            raise click.UsageError("--batch takes sources and targets from the manifest; leave out SOURCE and TARGET")
+    elif target is None or not sources:
+        raise click.UsageError(f"Missing argument '{'TARGET' if sources else 'SOURCE...'}'.")
+    elif where.resume or where.state is not None:
+        raise click.UsageError("--resume and --state belong to --batch; a sequence continues by itself")
+
+
+def is_missing(source: str) -> bool:
+    """Whether a source is neither there nor somewhere that only reading tells."""
+    return not any(mark in source for mark in "*?[") and not is_url(source) and not Path(local_path(source)).exists()
+
+
+@contextmanager
+def opened(where: Where, jobs: int | None, *, quiet: bool) -> Iterator[Engine | None]:
+    """Open the engine, and say where it can be watched; None for one conversion in this process."""
+    if where.scheduler == LOCAL and where.batch is None:
+        yield None
+        return
+    from gsplat_tools.cluster.engines import open_engine
+
+    engine = open_engine(where.scheduler, jobs, where.retries)
+    try:
+        if engine.dashboard and not quiet:
+            click.echo(f"{engine.workers} workers, dashboard {engine.dashboard}", err=True)
+        yield engine
+    finally:
+        engine.close()
+
+
+def convert_elsewhere(
+    sources: tuple[str, ...], target: Path, to: str | None, engine: Engine, where: Where, arguments: dict[str, Any]
+) -> dict[str, Any]:
+    """Convert a sequence as many tasks, and anything else as one; return its report."""
+    from gsplat_tools.cluster.batches import Item
+    from gsplat_tools.cluster.sequences import convert_sequence
+    from gsplat_tools.formats.loading import is_single
+    from gsplat_tools.retiming import DEFAULT_MOTION
+
+    record = find_target(target, to)
+    own = dict(arguments)
+    if record.id == "sog4d" and not (len(sources) == 1 and is_single(Path(local_path(sources[0])))):
+        for name, unset in (("time_at", None), ("frame", None), ("budget", None), ("auto", False), ("motion", DEFAULT_MOTION)):
+            if own.pop(name, unset) != unset:
+                raise CapabilityError(
+                    f"{name.replace('_at', '')} cannot be asked for on a cluster; find options on one machine, then give them"
+                )
+        own.pop("interpolation", None)
+        if own.pop("read_options", None):
+            raise CapabilityError("frames of other tools' bundles are converted on one machine")
+        return convert_sequence(sources, target, engine, parts=where.parts, **own).to_json()
+    item = Item(line=0, sources=sources, target=str(target), arguments={**own, "to": to})
+    outcome = next(engine.results([engine.submit(_convert, item)]))
+    return {**outcome.result(), "cluster": {"scheduler": engine.name, "workers": engine.workers, "dashboard": engine.dashboard}}
+
+
+def _convert(item: Item) -> dict[str, Any]:
+    """Convert, as a task."""
+    from gsplat_tools.convert import convert
+
+    return convert(item.sources, item.target, **item.arguments).to_json()
+
+
+def run_manifest(
+    context: click.Context, where: Where, jobs: int | None, arguments: Arguments, *, as_json: bool, quiet: bool
+) -> None:
+    """Convert what a manifest lists, and end with a status that tells whether all of it is there."""
+    from gsplat_tools.cluster.batches import STATE_SUFFIX, State, run_batch
+    from gsplat_tools.cluster.manifest import read_manifest
+
+    assert where.batch is not None
+    items = [_item(context, row, arguments) for row in read_manifest(where.batch)]
+    if where.state is None and is_url(where.batch):
+        raise click.UsageError("a manifest in a store needs --state FILE")
+    state = State(where.state or Path(f"{local_path(where.batch)}{STATE_SUFFIX}"), resume=where.resume)
+
+    def tell(report: dict[str, Any]) -> None:
+        if quiet and report["status"] != "failed":
+            return
+        text = f"{report['source']} -> {report['target']}"
+        if report["status"] == "failed":
+            click.echo(f"failed: {text}: {one_line(report['error']['message'])}", err=True)
+        elif not as_json:
+            click.echo(f"{report['status']}: {text}", err=True)
+
+    with opened(where, jobs, quiet=quiet) as engine:
+        assert engine is not None
+        report = run_batch(items, engine, state=state, resume=where.resume, tell=tell)
+    if as_json:
+        output.print_json(report)
+    elif not quiet:
+        click.echo(_summary(report["summary"]), err=True)
+    if report["summary"]["failed"]:
+        sys.exit(EXIT_DATA)
+
+
+def _summary(summary: dict[str, Any]) -> str:
+    """Return what a batch did in a line."""
+    return (
+        f"{summary['done']} done, {summary['kept']} kept, {summary['failed']} failed; "
+        f"{output.count(summary['source_bytes'])} bytes read, {output.count(summary['target_bytes'])} written, "
+        f"{summary['seconds']:.2f} s"
+    )
+
+
+def _item(context: click.Context, row: Row, arguments: Arguments) -> Item:
+    """Return the conversion of a row: its own options, those of the command where it has none."""
+    from gsplat_tools.cluster.batches import Item
+
+    try:
+        words = [word for name, value in row.options.items() for word in _words(context.command, name, value)]
+        own = context.command.make_context("gsplat-convert", [*words, "--", *row.sources, row.target])
+        given = dict(own.params)
+        for name in given:
+            was_given = context.get_parameter_source(name) is not ParameterSource.DEFAULT
+            if own.get_parameter_source(name) is ParameterSource.DEFAULT and was_given:
+                given[name] = context.params[name]
+        to = given["formats"][0] if given["formats"] else None
+        record = find_target(Path(local_path(row.target)), to)
+        found = arguments(given, [record])[0]
+    except click.UsageError as error:
+        raise click.UsageError(f"line {row.line} of the manifest: {error.message}") from error
+    except GsplatError as error:
+        raise click.UsageError(f"line {row.line} of the manifest: {error}") from error
+    return Item(
+        line=row.line,
+        sources=row.sources,
+        target=row.target,
+        arguments={**found, "to": to, "overwrite": given["overwrite"]},
+    )
+
+
+def _words(command: click.Command, name: str, value: Any) -> list[str]:
+    """Return an option of a manifest as words of a command line."""
+    flag = f"--{name.strip().lstrip('-').replace('_', '-')}"
+    option = next((each for each in command.params if flag in (*each.opts, *each.secondary_opts)), None)
+    if not isinstance(option, click.Option) or option.name in _OF_THE_COMMAND:
+        raise click.UsageError(f"{name!r} is no option of a conversion")
+    if option.is_flag:
+        word = str(value).lower()
+        if word not in ("true", "false", "1", "0", "yes", "no"):
+            raise click.UsageError(f"{name} is true or false, not {value!r}")
+        names = option.opts if word in ("true", "1", "yes") else option.secondary_opts
+        return list(names[:1])
+    if isinstance(value, list):
+        return [flag, ",".join(map(str, value))]
+    return [flag, str(value)]
