@@ -82,7 +82,8 @@ def _with_companion(stream: BinaryIO, path: Path, record: Format, head: bytes) -
     companion = read_beside(path, stream)
     if companion is None:
         raise UnknownFormatError(
-            f"a {path.suffix} file holds plain buffers, and {path_of(path).name}, which says what they are, is missing",
+            f"a {path.suffix} file holds plain buffers, and {path_of(path).name}, which says what they are, is missing; "
+            f'bring it along, or write one that names the format, such as {{"format": "{record.id}"}}',
             path=path,
         )
     attach(stream, companion)
