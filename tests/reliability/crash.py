@@ -29,6 +29,7 @@ from tests.reliability.faults import (
     die_halfway,
     failing,
     in_child,
+    interrupted_at_line,
     killed_at_line,
     leftovers,
     lines_of,
@@ -121,14 +122,12 @@ def targets(case: Case, splats: int, *, exists: bool) -> Iterator[Callable[[], T
         yield fresh
 
 
-def kill_at_operations(
-    case: Case, *, exists: bool, acts: Mapping[str, Act] = ACTS, most_writes: int | None = None
-) -> Counter[str]:
+def kill_at_operations(case: Case, *, exists: bool, acts: Mapping[str, Act] = ACTS, most: int | None = None) -> Counter[str]:
     """Kill the writer before, in the middle of and after every operation; run it once more after every few kills."""
     outcomes: Counter[str] = Counter()
     with targets(case, 12, exists=exists) as fresh:
         names = operations_of(fresh().write)
-        for number in chosen(names, most_writes):
+        for number in chosen(names, most):
             name = names[number]
             for moment, act in acts.items():
                 if moment == "halfway" and name != "write":
@@ -166,12 +165,33 @@ def kill_at_lines(case: Case, *, exists: bool, step: int = 1) -> Counter[str]:
     return outcomes
 
 
-def fail_at_operations(case: Case, *, exists: bool, most_writes: int | None = None) -> Counter[str]:
+def interrupt_at_lines(case: Case, *, exists: bool, step: int = 1) -> Counter[str]:
+    """Interrupt the writer, as the commands do on SIGTERM, before every line until it begins to publish and to clean up."""
+    outcomes: Counter[str] = Counter()
+    with targets(case, 12, exists=exists) as fresh:
+        places = lines_of(fresh().write)
+        # What an interruption of that leaves, the next run sweeps.
+        functions = [place.split(":")[1] for place in places]
+        complete = functions.index("read_back")
+        last = min(functions.index(name, complete) for name in ("_publish", "temporary_beside"))
+        first = {place: number for number, place in reversed(list(enumerate(places[:last])))}
+        for line in sorted(first.values())[::step]:
+            target = fresh()
+            what = f"interrupted at {places[line]}, line {line} of {len(places)}"
+            if not interrupted_at_line(target.write, line):
+                raise Broken(f"{case.id}, {what}: the interruption was swallowed")
+            outcomes[target.check(what)] += 1
+            if left := leftovers(target.path.parent):
+                raise Broken(f"{case.id}, {what}: {left} were left")
+    return outcomes
+
+
+def fail_at_operations(case: Case, *, exists: bool, most: int | None = None) -> Counter[str]:
     """Let every operation fail, every write fill the disk, and every write lose or change bytes."""
     outcomes: Counter[str] = Counter()
     with targets(case, 12, exists=exists) as fresh:
         names = operations_of(fresh().write)
-        for number in chosen(names, most_writes):
+        for number in chosen(names, most):
             for fault, act in FAULTS.items():
                 if fault != "EIO" and names[number] != "write":
                     continue
@@ -197,13 +217,14 @@ def fail_at_operations(case: Case, *, exists: bool, most_writes: int | None = No
     return outcomes
 
 
-def chosen(names: list[str], most_writes: int | None) -> list[int]:
-    """Return the numbers of all operations, or of all but writes and some of those, the first and the last among them."""
-    writes = [number for number, name in enumerate(names) if name == "write"]
-    if most_writes is None or len(writes) <= most_writes:
-        return list(range(len(names)))
-    kept = {writes[round(i * (len(writes) - 1) / (most_writes - 1))] for i in range(most_writes)}
-    return [number for number, name in enumerate(names) if name != "write" or number in kept]
+def chosen(names: list[str], most: int | None) -> list[int]:
+    """Return the numbers of all operations, or of so many of each name, the first and the last among them."""
+    kept: set[int] = set()
+    for name in dict.fromkeys(names):
+        numbers = [number for number, other in enumerate(names) if other == name]
+        count = len(numbers) if most is None else min(most, len(numbers))
+        kept.update(numbers[round(i * (len(numbers) - 1) / max(1, count - 1))] for i in range(count))
+    return sorted(kept)
 
 
 def kill_at_random(case: Case, *, exists: bool, times: int, splats: int = RANDOM_SPLATS, seed: int = 0) -> Counter[str]:
@@ -247,6 +268,7 @@ def main() -> int:
         for what, kill in (
             ("operations", kill_at_operations),
             ("lines", kill_at_lines),
+            ("interrupted", interrupt_at_lines),
             ("failed, lossy", fail_at_operations),
             ("random moments", lambda case, *, exists: kill_at_random(case, exists=exists, times=-(-given.kills // 2))),
         ):

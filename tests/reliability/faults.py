@@ -180,6 +180,24 @@ def killed_at_line(work: Callable[[], object], line: int) -> int:
     return in_child(lambda: _traced(work, count_down))
 
 
+def interrupted_at_line(work: Callable[[], object], line: int) -> bool:
+    """Do some work that a SystemExit, as from a signal, ends when a line of TRACED is about to run; return whether it did."""
+
+    def count_down(number: int, _place: str) -> None:
+        if number == line:
+            raise SystemExit
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # a file that nobody got to see is closed with its object
+        try:
+            _traced(work, count_down)
+        except SystemExit:
+            is_ended = True
+        else:
+            is_ended = False
+    return is_ended
+
+
 def lines_of(work: Callable[[], object]) -> list[str]:
     """Return where every line of TRACED that some work runs stands, in the order in which they run."""
     places: list[str] = []
@@ -196,8 +214,8 @@ def _traced(work: Callable[[], object], at: Callable[[int, str], object]) -> Non
         if event == "call" and not frame.f_code.co_filename.endswith(TRACED):
             return None
         if event == "line":
-            at(count, f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}")
-            count += 1
+            number, count = count, count + 1
+            at(number, f"{Path(frame.f_code.co_filename).name}:{frame.f_code.co_name}:{frame.f_lineno}")
         return trace
 
     before = sys.gettrace()

@@ -19,7 +19,16 @@ import pytest
 from gsplat_tools.errors import WriteError
 from gsplat_tools.formats import _files
 from tests.reliability.cases import Case, cases
-from tests.reliability.crash import ACTS, NEW, fail_at_operations, kill_at_lines, kill_at_operations, kill_at_random, targets
+from tests.reliability.crash import (
+    ACTS,
+    NEW,
+    fail_at_operations,
+    interrupt_at_lines,
+    kill_at_lines,
+    kill_at_operations,
+    kill_at_random,
+    targets,
+)
 from tests.reliability.faults import EXIT_REFUSED, Operations, failing, in_child, leftovers, operations_of
 
 every_writer = pytest.mark.parametrize("case", cases(), ids=lambda case: case.id)
@@ -33,10 +42,10 @@ old_or_absent = pytest.mark.parametrize("exists", [True, False], ids=["old", "ab
 
 @every_writer
 @old_or_absent
-def test_kill__at_every_operation_leaves_the_old_or_the_new_target(case: Case, exists: bool) -> None:
+def test_kill__at_operations_leaves_the_old_or_the_new_target(case: Case, exists: bool) -> None:
     acts = {name: ACTS[name] for name in ("before", "halfway")}  # after one is before the next
 
-    outcomes = kill_at_operations(case, exists=exists, acts=acts, most_writes=4)
+    outcomes = kill_at_operations(case, exists=exists, acts=acts, most=2)
 
     assert outcomes["new"] > 0
     assert outcomes["old" if exists else "absent"] > 0
@@ -45,20 +54,28 @@ def test_kill__at_every_operation_leaves_the_old_or_the_new_target(case: Case, e
 @one_of_each_kind
 @old_or_absent
 def test_kill__at_lines_leaves_the_old_or_the_new_target(case: Case, exists: bool) -> None:
-    outcomes = kill_at_lines(case, exists=exists, step=9)
+    outcomes = kill_at_lines(case, exists=exists, step=25)
 
     assert outcomes["old" if exists else "absent"] > 0
 
 
+@one_of_each_kind
+@old_or_absent
+def test_interruption__at_lines_leaves_no_temporary(case: Case, exists: bool) -> None:
+    outcomes = interrupt_at_lines(case, exists=exists, step=7)
+
+    assert set(outcomes) == {"old" if exists else "absent"}
+
+
 @every_writer
 def test_kill__at_random_leaves_the_old_or_the_new_target(case: Case) -> None:
-    assert kill_at_random(case, exists=True, times=3, splats=500)
+    assert kill_at_random(case, exists=True, times=2, splats=300)
 
 
 @every_writer
 @old_or_absent
 def test_faults__at_any_operation_are_errors_or_do_no_harm(case: Case, exists: bool) -> None:
-    outcomes = fail_at_operations(case, exists=exists, most_writes=3)
+    outcomes = fail_at_operations(case, exists=exists, most=2)
 
     assert outcomes["old" if exists else "absent"] > 0
 
