@@ -13,6 +13,9 @@ from gsplat_tools.viewing.payload import Exhibit
 _EMPTY = '<script type="application/json" id="config">{"files":[],"cameras":[]}</script>'
 """What `viewer/index.html` has where the configuration goes."""
 
+_LARGEST_INSIDE = 384 << 20
+"""Bytes; as base64 the largest text that Chromium holds, 512 MiB."""
+
 
 def template() -> str:
     """Return the page as it was built, without files.
@@ -43,11 +46,16 @@ def offline_page(exhibit: Exhibit) -> str:
     Raises
     ------
     CapabilityError
-        A file cannot be shown.
+        A file cannot be shown, or is larger than a page can hold.
     """
     for payload in exhibit.payloads:
         if payload.error:
-            raise CapabilityError(f"it cannot be shown: {payload.error}", path=payload.source)
+            raise CapabilityError(f"a file cannot be shown: {payload.error}")
+        if payload.path.stat().st_size > _LARGEST_INSIDE:
+            raise CapabilityError(
+                f"a page holds files of up to {_LARGEST_INSIDE:,} bytes; leave out --html, or convert it first",
+                path=payload.source,
+            )
     entries = [{**payload.to_json(), "embedded": f"file-{i}"} for i, payload in enumerate(exhibit.payloads)]
     inside = "".join(
         f'<script type="application/octet-stream" id="file-{i}">{base64.b64encode(payload.path.read_bytes()).decode()}</script>'

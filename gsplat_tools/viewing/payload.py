@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.convert import convert
@@ -18,7 +19,7 @@ from gsplat_tools.formats.base import FileInfo
 from gsplat_tools.formats.loading import inspect_file, load
 from gsplat_tools.formats.saving import save
 from gsplat_tools.ops.coordinates import convert_coordinates
-from gsplat_tools.ops.recentering import recenter, without_origin
+from gsplat_tools.ops.recentering import recenter
 from gsplat_tools.reference.auto_cameras import auto_cameras, robust_sphere, world_axes
 from gsplat_tools.sequence import GaussianSequence
 
@@ -26,6 +27,11 @@ READ_IN_THE_PAGE = {"spark": "gspk", "sog4d": "sog4d", "ply": "ply", "spz": "spz
 """Formats that the page reads by itself, and what it calls them."""
 
 _VIEWS, _SIZE = 8, (1280, 720)
+_DRAWN_DEGREE = 3
+"""Spark 2.2 has no fourth band."""
+_FAR = 8.0
+"""Radii from zero beyond which a scene is drawn about its own middle: halves would show steps."""
+_OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,21 +93,57 @@ def prepare_exhibit(files: list[Path], keep: ExitStack) -> Exhibit:
     """
     folder = Path(keep.enter_context(TemporaryDirectory(prefix="gsplat-view-")))
     payloads: list[Payload] = []
-    frame: GaussianCloud | None = None
+    place: _Place | None = None
     for index, file in enumerate(files):
         try:
-            payload, cloud = _prepare(file, folder / str(index), frame)
+            payload, found = _prepare(file, folder / str(index), place)
         except FormatError as error:
             payloads.append(Payload(path=file, source=file, error=str(error)))
             continue
         payloads.append(payload)
-        if frame is None:
-            frame = cloud
-    return Exhibit(payloads=payloads, view={} if frame is None or len(frame) == 0 else _view_of(frame))
+        place = place or found
+    return Exhibit(payloads=payloads, view={} if place is None else place.to_json())
 
 
-def _prepare(file: Path, target: Path, frame: GaussianCloud | None) -> tuple[Payload, GaussianCloud]:
-    """Return a file as the page takes it, and its first frame in the coordinates that the page draws."""
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """The first scene as it is drawn, in axes that are right-handed and about an origin near it; and how it got there."""
+
+    cloud: GaussianCloud
+    world: NDArray[np.float64]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return cameras around the scene, its middle, its direction up, and the way from the file's coordinates."""
+        if len(self.cloud) == 0:
+            return {}
+        drawn = self.cloud.replace(origin=np.zeros(3))
+        return {
+            "cameras": [camera.to_json() for camera in auto_cameras(drawn, views=_VIEWS, size=_SIZE)],
+            "center": robust_sphere(drawn)[0].tolist(),
+            "up": world_axes(drawn.coordinate_system)[1].tolist(),
+            "world": self.world.tolist(),
+        }
+
+
+def _place_of(cloud: GaussianCloud) -> _Place:
+    """Return where a scene that comes first is drawn: three.js is right-handed, and Spark's positions are halves."""
+    drawn = cloud
+    matrix = np.eye(3)
+    axes = world_axes(cloud.coordinate_system)
+    if np.linalg.det(axes) < 0:
+        target = cloud.coordinate_system[:2] + _OPPOSITE[cloud.coordinate_system[2]]
+        drawn, matrix = convert_coordinates(cloud, target), np.diag([1.0, 1.0, -1.0])
+    if len(drawn):
+        center, radius = robust_sphere(drawn)
+        if np.linalg.norm(center - drawn.origin) > _FAR * radius:
+            drawn = recenter(drawn, center)
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = matrix, -drawn.origin
+    return _Place(drawn, world)
+
+
+def _prepare(file: Path, target: Path, place: _Place | None) -> tuple[Payload, _Place]:
+    """Return a file as the page takes it, and where its first frame is drawn if it is the first."""
     record, info = inspect_file(file)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GsplatWarning)
@@ -111,20 +153,40 @@ def _prepare(file: Path, target: Path, frame: GaussianCloud | None) -> tuple[Pay
             report = convert([file], baked, validation=None)
             moving = load(baked)
             assert isinstance(moving, GaussianSequence)
-            note = f"baked to {report.frames} keyframes"
-            payload = Payload(path=baked, source=file, kind="sog4d", note=note, splats=report.splats, frames=report.frames)
-            return payload, moving.frame(0)
+            first, notes = moving.frame(0), [f"baked to {report.frames} keyframes"]
+            notes += _unmoved(first, place)
+            payload = Payload(
+                path=baked, source=file, kind="sog4d", note=", ".join(notes), splats=report.splats, frames=report.frames
+            )
+            return payload, _Place(first, np.eye(4))
         first = scene.frame(0) if isinstance(scene, GaussianSequence) else scene
-        frames = len(scene) if isinstance(scene, GaussianSequence) else 1
-        facts: dict[str, Any] = {"source": file, "splats": len(first), "frames": frames}
-        moved = None if isinstance(scene, GaussianSequence) else _brought_beside(first, frame)
-        if record.id in READ_IN_THE_PAGE and moved is None and _is_plain(record.id, info, first):
-            return Payload(path=file, kind=READ_IN_THE_PAGE[record.id], **facts), first.replace(origin=np.zeros(3))
+        if isinstance(scene, GaussianSequence):
+            note = ", ".join(_unmoved(first, place))
+            kind = READ_IN_THE_PAGE[record.id]
+            payload = Payload(path=file, source=file, kind=kind, note=note, splats=len(first), frames=len(scene))
+            return payload, _Place(first, np.eye(4))
+        drawn = _place_of(first) if place is None else _Place(_brought_beside(first, place.cloud), place.world)
+        facts: dict[str, Any] = {"source": file, "splats": len(first)}
+        is_whole = info.splats in (None, len(first))
+        if drawn.cloud is first and is_whole and record.id in READ_IN_THE_PAGE and _is_plain(record.id, info, first):
+            return Payload(path=file, kind=READ_IN_THE_PAGE[record.id], **facts), drawn
         packed = target.with_suffix(".gspk")
-        cloud = first if moved is None else moved
-        save(cloud.replace(origin=np.zeros(3)), packed, to="spark", spark_encoding="fit", recenter="off", order="none")
-    note = "in Spark's layout" if moved is None else "in Spark's layout, brought beside the first"
-    return Payload(path=packed, kind="gspk", note=note, **facts), cloud.replace(origin=np.zeros(3))
+        cloud = drawn.cloud.replace(origin=np.zeros(3))
+        save(cloud, packed, to="spark", spark_encoding="fit", recenter="off", order="none")
+    notes = ["in Spark's layout"]
+    if not is_whole:
+        notes.append(f"without {info.splats - len(first):,} invalid splats")
+    if first.sh_degree > _DRAWN_DEGREE:
+        notes.append(f"without SH band {first.sh_degree}")
+    if drawn.cloud is not first and place is not None:
+        notes.append("brought beside the first")
+    return Payload(path=packed, kind="gspk", note=", ".join(notes), **facts), drawn
+
+
+def _unmoved(first: GaussianCloud, place: _Place | None) -> list[str]:
+    """Say that a sequence stays where it is, where the first file is drawn elsewhere."""
+    is_apart = place is not None and _brought_beside(first, place.cloud) is not first
+    return ["not brought beside the first"] if is_apart else []
 
 
 def _is_plain(format_id: str, info: FileInfo, cloud: GaussianCloud) -> bool:
@@ -132,29 +194,13 @@ def _is_plain(format_id: str, info: FileInfo, cloud: GaussianCloud) -> bool:
     if format_id == "spz" and info.version not in {"1", "2", "3"}:
         return False
     if format_id == "ply":
-        return "little" in str(info.encoding.get("encoding", info.version)) and cloud.sh_degree <= 3
-    return cloud.sh_degree <= 3
+        return "little" in str(info.encoding.get("encoding", info.version)) and cloud.sh_degree <= _DRAWN_DEGREE
+    return cloud.sh_degree <= _DRAWN_DEGREE
 
 
-def _brought_beside(cloud: GaussianCloud, frame: GaussianCloud | None) -> GaussianCloud | None:
-    """Return the cloud in the axes and about the origin of another, or None where it is there already."""
-    if frame is None:
-        return None
-    moved = cloud
-    systems = (cloud.coordinate_system, frame.coordinate_system)
+def _brought_beside(cloud: GaussianCloud, other: GaussianCloud) -> GaussianCloud:
+    """Return the cloud in the axes and about the origin of another; the same object where it is there already."""
+    systems = (cloud.coordinate_system, other.coordinate_system)
     if "unknown" not in systems and systems[0] != systems[1]:
-        moved = convert_coordinates(without_origin(moved), frame.coordinate_system)
-    if not np.array_equal(moved.origin, frame.origin):
-        moved = recenter(moved, frame.origin)
-    return None if moved is cloud else moved
-
-
-def _view_of(cloud: GaussianCloud) -> dict[str, Any]:
-    """Return cameras around a scene, its middle and its direction up."""
-    center, _ = robust_sphere(cloud)
-    cameras = auto_cameras(cloud, views=_VIEWS, size=_SIZE)
-    return {
-        "cameras": [camera.to_json() for camera in cameras],
-        "center": center.tolist(),
-        "up": world_axes(cloud.coordinate_system)[1].tolist(),
-    }
+        cloud = convert_coordinates(cloud, other.coordinate_system)
+    return cloud if np.array_equal(cloud.origin, other.origin) else recenter(cloud, other.origin)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import shutil
+import sys
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -32,6 +34,11 @@ class ViewServer(ThreadingHTTPServer):
         Files to show.
     port
         Port to listen on; 0 lets the system choose.
+
+    Raises
+    ------
+    OSError
+        The port is in use, or not ours to use.
     """
 
     daemon_threads = True
@@ -39,7 +46,18 @@ class ViewServer(ThreadingHTTPServer):
     def __init__(self, exhibit: Exhibit, port: int = 0) -> None:
         self.exhibit = exhibit
         self.page = served_page(exhibit).encode("utf-8")
-        super().__init__((HOST, port), _Handler)
+        try:
+            super().__init__((HOST, port), _Handler)
+        except OSError as error:
+            reason = (
+                "in use; name another" if error.errno == errno.EADDRINUSE else f"not to be had ({error.strerror}); name another"
+            )
+            raise OSError(error.errno, f"port {port} of {HOST} is {reason} with --port, or leave it out") from error
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of connections that the browser cut."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
 
     @property
     def address(self) -> str:

@@ -71,7 +71,7 @@ class View:
     @property
     def message(self) -> str:
         """What the page tells the user, or nothing."""
-        return self.page.inner_text("#message") if self.page.is_visible("#message") else ""
+        return self.page.inner_text("#words") if self.page.is_visible("#message") else ""
 
 
 @pytest.fixture

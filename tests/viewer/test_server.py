@@ -63,5 +63,15 @@ def test_view__writes_a_page_and_replaces_none_unasked(scene: Path, tmp_path: Pa
     assert "--overwrite" in second.stderr
 
 
+def test_view__says_that_a_port_is_in_use(scene: Path) -> None:
+    with serving(scene) as server:
+        port = server.server_address[1]
+        result = CliRunner().invoke(main, ["view", str(scene), "--no-open", "--port", str(port)])
+
+    assert result.exit_code == 1
+    assert f"port {port}" in result.stderr
+    assert "--port" in result.stderr
+
+
 def test_view__of_three_files_is_a_usage_error(scene: Path) -> None:
     assert CliRunner().invoke(main, ["view", *[str(scene)] * 3]).exit_code == 2

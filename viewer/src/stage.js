@@ -33,6 +33,11 @@ export class Stage {
     }
   }
 
+  /** Whether an order of the splats is still to come. */
+  isBusy() {
+    return this.sides.some(({ sparkRenderer: each }) => each.sorting || each.sortDirty || each.display !== each.current);
+  }
+
   resize(width, height) {
     this.renderer.setSize(width, height, false);
     for (const target of this.difference.targets) {
@@ -123,10 +128,15 @@ export function exactCamera({ viewmat, K, width, height, near, far }) {
   return camera;
 }
 
-/** A camera of the page as `gsplat-inspect render --camera` reads it. */
-export function describeCamera(camera, width, height) {
+/**
+ * A camera of the page as `gsplat-inspect render --camera` reads it.
+ *
+ * @param {number[][]} [world] rows of the matrix that brings the file's coordinates to those that are drawn
+ */
+export function describeCamera(camera, width, height, world) {
   camera.updateMatrixWorld(true);
   const view = new THREE.Matrix4().copy(camera.matrixWorld).invert().premultiply(new THREE.Matrix4().makeScale(1, -1, -1));
+  if (world) view.multiply(new THREE.Matrix4().set(...world.flat()));
   const rows = [0, 1, 2, 3].map((row) => [0, 1, 2, 3].map((column) => view.elements[4 * column + row]));
   const focal = height / 2 / Math.tan(THREE.MathUtils.degToRad(camera.fov) / 2);
   const K = [

@@ -6,6 +6,7 @@ import { BlobReader, Uint8ArrayWriter, ZipReader, configure } from "@zip.js/zip.
 
 configure({ useWebWorkers: false }); // this is a worker already
 
+const [LOCAL_HEADER_BYTES, LOCAL_HEADER_MAGIC] = [30, 0x04034b50];
 const DELTA_MAGIC = "SOG4DLB1";
 const DELTA_HEADER_BYTES = 28;
 const UPDATE_BYTES = 8;
@@ -28,8 +29,10 @@ export class Bundle {
    *
    * @param {Blob} blob the file
    * @param {(bytes: ArrayBuffer) => Promise<{width: number, height: number, data: Uint8ClampedArray}>} decodeWebp
+   * @param {object} [options]
+   * @param {boolean} [options.hasPalettes] whether the values of the SH palettes are read
    */
-  static async open(blob, decodeWebp) {
+  static async open(blob, decodeWebp, { hasPalettes = true } = {}) {
     let entries;
     try {
       entries = await new ZipReader(new BlobReader(blob)).getEntries();
@@ -38,17 +41,20 @@ export class Bundle {
     }
     // Of entries with the same name the last one counts.
     const byName = new Map(entries.map((entry) => [entry.filename, entry]));
-    const bundle = new Bundle(byName, decodeWebp);
+    const bundle = new Bundle(blob, byName, decodeWebp);
     const text = new TextDecoder("utf-8", { fatal: true }).decode(await bundle.bytes("meta.json"));
     bundle.readMeta(JSON.parse(text));
-    await bundle.readPalettes();
+    if (hasPalettes) await bundle.readPalettes();
     return bundle;
   }
 
-  constructor(entries, decodeWebp) {
+  constructor(blob, entries, decodeWebp) {
+    this.blob = blob;
     this.entries = entries;
     this.decodeWebp = decodeWebp;
     this.deltas = new Map();
+    this.last = new Map(); // stream -> {bytes, value}: what does not change from frame to frame is decoded once
+    this.shown = new Map(); // palette -> {segment, frame, labels}: later frames of a segment go on from there
   }
 
   /** Take over what meta.json says, with numbers as the float32 that every reader makes of them. */
@@ -96,12 +102,25 @@ export class Bundle {
   async bytes(path) {
     const entry = this.entries.get(path);
     if (!entry) throw new Sog4dError("the archive has no such file", path);
-    return entry.getData(new Uint8ArrayWriter(), { checkSignature: true });
+    const isStored = entry.compressionMethod === 0 && !entry.encrypted && entry.compressedSize === entry.uncompressedSize;
+    const header = new DataView(await this.blob.slice(entry.offset, entry.offset + LOCAL_HEADER_BYTES).arrayBuffer());
+    const isHere = header.byteLength === LOCAL_HEADER_BYTES && header.getUint32(0, true) === LOCAL_HEADER_MAGIC;
+    if (!isStored || !isHere) return entry.getData(new Uint8ArrayWriter(), { checkSignature: true });
+    // As they lie in the file, without the streams of the library, which take longer than decoding an image.
+    const start = entry.offset + LOCAL_HEADER_BYTES + header.getUint16(26, true) + header.getUint16(28, true);
+    const bytes = new Uint8Array(await this.blob.slice(start, start + entry.uncompressedSize).arrayBuffer());
+    if (bytes.length !== entry.uncompressedSize || crc32(bytes) !== entry.signature >>> 0) {
+      throw new Sog4dError("the bytes do not have the checksum of the directory", path);
+    }
+    return bytes;
   }
 
   /** RGBA bytes of an image, as stored. */
   async pixels(path) {
-    const bytes = await this.bytes(path);
+    return this.decode(await this.bytes(path), path);
+  }
+
+  async decode(bytes, path) {
     let image;
     try {
       image = await this.decodeWebp(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength));
@@ -114,35 +133,75 @@ export class Bundle {
     return image.data;
   }
 
+  /** What `make` makes of an image; the same bytes as the last of the stream give the same value again. */
+  async stream(name, path, make) {
+    const bytes = await this.bytes(path);
+    const last = this.last.get(name);
+    if (last && areEqual(last.bytes, bytes)) return last.value;
+    const value = make(await this.decode(bytes, path));
+    this.last.set(name, { bytes, value });
+    return value;
+  }
+
   /**
    * Stored values of a keyframe: means, logScales, quats (wxyz, unit, w >= 0), opacities, sh0, and labels of each palette.
+   * Arrays other than means may be those of an earlier keyframe.
    */
   async keyframe(frame) {
-    const images = {};
-    for (const [name, template] of Object.entries(this.paths)) images[name] = await this.pixels(framePath(template, frame));
-    const { splatCount: count, logScales: codebook, sh0Codebook } = this;
-    const means = new Float32Array(3 * count);
-    const logScales = new Float32Array(3 * count);
-    const sh0 = new Float32Array(3 * count);
-    const opacities = new Float32Array(count);
-    const low = this.rangeMin[frame];
-    const steps = this.rangeMax[frame].map((high, axis) => (high - low[axis]) / 65535);
-    for (let i = 0; i < count; i++) {
-      const index = images.scale[4 * i] | (images.scale[4 * i + 1] << 8);
-      if (3 * index >= codebook.length) {
-        throw new Sog4dError(`scale index ${index} of splat ${i} is not in the codebook`, framePath(this.paths.scale, frame));
-      }
-      for (let axis = 0; axis < 3; axis++) {
-        const at = 4 * i + axis;
-        means[3 * i + axis] = low[axis] + (images.lo[at] | (images.hi[at] << 8)) * steps[axis];
-        logScales[3 * i + axis] = codebook[3 * index + axis];
-        sh0[3 * i + axis] = sh0Codebook[images.sh0[at]];
-      }
-      opacities[i] = images.sh0[4 * i + 3] / 255;
+    const stream = (name, make) => {
+      const path = framePath(this.paths[name], frame);
+      return this.stream(name, path, (pixels) => make(pixels, path));
+    };
+    const [high, low, logScales, quats, { sh0, opacities }, ...labels] = await Promise.all([
+      stream("hi", (pixels) => pixels),
+      stream("lo", (pixels) => pixels),
+      stream("scale", (pixels, path) => this.decodeScales(pixels, path)),
+      stream("rotation", (pixels) => decodeQuaternions(pixels, this.splatCount)),
+      stream("sh0", (pixels) => this.decodeColors(pixels)),
+      ...this.palettes.map((palette) => this.labels(palette, frame)),
+    ]);
+    return { frame, count: this.splatCount, means: this.decodeMeans(high, low, frame), logScales, quats, opacities, sh0, labels };
+  }
+
+  decodeMeans(high, low, frame) {
+    const [x0, y0, z0] = this.rangeMin[frame];
+    const [x1, y1, z1] = this.rangeMax[frame];
+    const [dx, dy, dz] = [(x1 - x0) / 65535, (y1 - y0) / 65535, (z1 - z0) / 65535];
+    const means = new Float32Array(3 * this.splatCount);
+    for (let k = 0, at = 0; k < means.length; k += 3, at += 4) {
+      means[k] = x0 + (low[at] | (high[at] << 8)) * dx;
+      means[k + 1] = y0 + (low[at + 1] | (high[at + 1] << 8)) * dy;
+      means[k + 2] = z0 + (low[at + 2] | (high[at + 2] << 8)) * dz;
     }
-    const labels = [];
-    for (const palette of this.palettes) labels.push(await this.labels(palette, frame));
-    return { frame, count, means, logScales, quats: decodeQuaternions(images.rotation, count), opacities, sh0, labels };
+    return means;
+  }
+
+  decodeScales(pixels, path) {
+    const codebook = this.logScales;
+    const logScales = new Float32Array(3 * this.splatCount);
+    for (let k = 0, at = 0; k < logScales.length; k += 3, at += 4) {
+      const entry = 3 * (pixels[at] | (pixels[at + 1] << 8));
+      if (entry >= codebook.length) {
+        throw new Sog4dError(`scale index ${entry / 3} of splat ${k / 3} is not in the codebook`, path);
+      }
+      logScales[k] = codebook[entry];
+      logScales[k + 1] = codebook[entry + 1];
+      logScales[k + 2] = codebook[entry + 2];
+    }
+    return logScales;
+  }
+
+  decodeColors(pixels) {
+    const codebook = this.sh0Codebook;
+    const sh0 = new Float32Array(3 * this.splatCount);
+    const opacities = new Float32Array(this.splatCount);
+    for (let i = 0, k = 0, at = 0; i < opacities.length; i++, k += 3, at += 4) {
+      sh0[k] = codebook[pixels[at]];
+      sh0[k + 1] = codebook[pixels[at + 1]];
+      sh0[k + 2] = codebook[pixels[at + 2]];
+      opacities[i] = pixels[at + 3] / 255;
+    }
+    return { sh0, opacities };
   }
 
   /** Labels of a palette in a frame. */
@@ -150,23 +209,31 @@ export class Bundle {
     if (!palette.segments) return this.labelImage(palette, framePath(palette.labelsPath, frame));
     const segment = palette.segments.find(({ startFrame, frameCount }) => frame < startFrame + frameCount);
     if (!segment) throw new Sog4dError(`no segment covers frame ${frame}`, palette.name);
-    const labels = await this.labelImage(palette, segment.baseLabelsPath);
     const blocks = await this.delta(segment, palette);
-    for (const { splats, values } of blocks.slice(0, frame - segment.startFrame)) {
-      for (let k = 0; k < splats.length; k++) labels[splats[k]] = values[k];
+    let state = this.shown.get(palette);
+    if (state?.segment !== segment || state.frame > frame) {
+      const base = await this.labelImage(palette, segment.baseLabelsPath);
+      state = { segment, frame: segment.startFrame, labels: base.slice() };
     }
-    return labels;
+    // Nothing is waited for from here on, so that frames that are decoded at the same time do not mix.
+    for (const { splats, values } of blocks.slice(state.frame - segment.startFrame, frame - segment.startFrame)) {
+      for (let k = 0; k < splats.length; k++) state.labels[splats[k]] = values[k];
+    }
+    state.frame = frame;
+    this.shown.set(palette, state);
+    return state.labels.slice();
   }
 
   /** Labels that are stored whole. */
-  async labelImage(palette, path) {
-    const pixels = await this.pixels(path);
-    const labels = new Uint16Array(this.splatCount);
-    for (let i = 0; i < labels.length; i++) {
-      labels[i] = pixels[4 * i] | (pixels[4 * i + 1] << 8);
-      if (labels[i] >= palette.count) throw new Sog4dError(`label ${labels[i]} of splat ${i} is not in the palette`, path);
-    }
-    return labels;
+  labelImage(palette, path) {
+    return this.stream(palette.name, path, (pixels) => {
+      const labels = new Uint16Array(this.splatCount);
+      for (let i = 0, at = 0; i < labels.length; i++, at += 4) {
+        labels[i] = pixels[at] | (pixels[at + 1] << 8);
+        if (labels[i] >= palette.count) throw new Sog4dError(`label ${labels[i]} of splat ${i} is not in the palette`, path);
+      }
+      return labels;
+    });
   }
 
   /** Changes of a segment, a block a later frame; read once. */
@@ -247,6 +314,39 @@ function readDelta(bytes, segment, palette, splatCount) {
     at += 4 + count * UPDATE_BYTES;
   }
   return blocks;
+}
+
+let crcTables;
+
+/** CRC-32 as ZIP has it, four bytes at a time. */
+function crc32(bytes) {
+  crcTables ??= makeCrcTables();
+  const [t0, t1, t2, t3] = crcTables;
+  let crc = -1;
+  let i = 0;
+  for (const end = bytes.length - 3; i < end; i += 4) {
+    crc ^= bytes[i] | (bytes[i + 1] << 8) | (bytes[i + 2] << 16) | (bytes[i + 3] << 24);
+    crc = t3[crc & 255] ^ t2[(crc >>> 8) & 255] ^ t1[(crc >>> 16) & 255] ^ t0[crc >>> 24];
+  }
+  for (; i < bytes.length; i++) crc = t0[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
+  return ~crc >>> 0;
+}
+
+function makeCrcTables() {
+  const first = Int32Array.from({ length: 256 }, (_, byte) => {
+    let crc = byte;
+    for (let bit = 0; bit < 8; bit++) crc = (crc >>> 1) ^ (crc & 1 ? 0xedb88320 : 0);
+    return crc;
+  });
+  const tables = [first];
+  for (let k = 1; k < 4; k++) tables.push(tables[k - 1].map((crc) => (crc >>> 8) ^ first[crc & 255]));
+  return tables;
+}
+
+function areEqual(a, b) {
+  if (a.length !== b.length) return false;
+  for (let i = 0; i < a.length; i++) if (a[i] !== b[i]) return false;
+  return true;
 }
 
 /** Bytes w x y z to unit quaternions with w >= 0; four times 128 has no direction and is the identity. */

@@ -8,7 +8,7 @@ let bundle;
 onmessage = async ({ data: { blob, port } }) => {
   const opened = (async () => {
     await init(await WebAssembly.compile(await (await fetch(wasmAddress)).arrayBuffer()));
-    bundle = await Bundle.open(blob, decode);
+    bundle = await Bundle.open(blob, decode, { hasPalettes: false });
   })();
   port.onmessage = async ({ data: { frame, path } }) => {
     const key = path ?? frame;
@@ -19,9 +19,9 @@ onmessage = async ({ data: { blob, port } }) => {
         port.postMessage({ key, pixels }, [pixels.buffer]);
         return;
       }
+      // Only the positions are sure to be this keyframe's own: the rest is copied, since later ones may share it.
       const keyframe = await bundle.keyframe(frame);
-      const buffers = [keyframe.means, keyframe.logScales, keyframe.quats, keyframe.opacities, keyframe.sh0, ...keyframe.labels];
-      port.postMessage({ key, keyframe }, buffers.map(({ buffer }) => buffer));
+      port.postMessage({ key, keyframe }, [keyframe.means.buffer]);
     } catch (error) {
       port.postMessage({ key, error: String(error?.message ?? error) });
     }

@@ -9,28 +9,27 @@ const VISIBLE = (1 / 255) * (1 - 1e-6); // a stored byte of 1 passes
 /**
  * What is drawn between two keyframes (`Bundle.keyframe`); `fraction` 0 gives the first as stored.
  *
+ * @param {object} [room] arrays of an earlier call, to be written again: nothing is allocated while a sequence plays
  * @returns {{means: Float32Array, logScales: Float32Array, quats: Float32Array, opacities: Float32Array, sh0: Float32Array}}
  */
-export function evaluate(a, b, fraction) {
-  const opacities = new Float32Array(a.count);
+export function evaluate(a, b, fraction, room = {}) {
+  const take = (name, length) => (room[name] = room[name]?.length === length ? room[name] : new Float32Array(length));
+  const opacities = take("opacities", a.count);
   if (fraction === 0 || a.frame === b.frame) {
     for (let i = 0; i < a.count; i++) opacities[i] = a.opacities[i] < VISIBLE ? 0 : a.opacities[i];
     return { means: a.means, logScales: a.logScales, quats: a.quats, opacities, sh0: a.sh0 };
   }
-  for (let i = 0; i < a.count; i++) {
-    const opacity = mix(a.opacities[i], b.opacities[i], fraction);
+  const [from, to] = [a.opacities, b.opacities];
+  for (let i = 0; i < opacities.length; i++) {
+    const opacity = mix(from[i], to[i], fraction);
     opacities[i] = opacity < VISIBLE ? 0 : opacity;
   }
-  const logScales = new Float32Array(3 * a.count);
-  for (let k = 0; k < logScales.length; k++) {
-    logScales[k] = mix(Math.max(a.logScales[k], LOG_FLOOR), Math.max(b.logScales[k], LOG_FLOOR), fraction);
-  }
   return {
-    means: mixed(a.means, b.means, fraction),
-    logScales,
-    quats: mixedRotations(a.quats, b.quats, fraction),
+    means: mixInto(take("means", 3 * a.count), a.means, b.means, fraction, -Infinity),
+    logScales: mixInto(take("logScales", 3 * a.count), a.logScales, b.logScales, fraction, LOG_FLOOR),
+    quats: mixRotationsInto(take("quats", 4 * a.count), a.quats, b.quats, fraction),
     opacities,
-    sh0: mixed(a.sh0, b.sh0, fraction),
+    sh0: mixInto(take("sh0", 3 * a.count), a.sh0, b.sh0, fraction, -Infinity),
   };
 }
 
@@ -56,19 +55,22 @@ export function evaluateRest(palettes, coefficients, a, b, fraction) {
   return rest;
 }
 
-function mix(a, b, fraction) {
+export function mix(a, b, fraction) {
   return a + (b - a) * fraction; // keeps equal values as they are
 }
 
-function mixed(a, b, fraction) {
-  const result = new Float32Array(a.length);
-  for (let k = 0; k < a.length; k++) result[k] = mix(a[k], b[k], fraction);
+/** Values between two lists, both raised to a floor. */
+function mixInto(result, a, b, fraction, floor) {
+  for (let k = 0; k < result.length; k++) {
+    const from = a[k] > floor ? a[k] : floor;
+    const to = b[k] > floor ? b[k] : floor;
+    result[k] = mix(from, to, fraction);
+  }
   return result;
 }
 
-function mixedRotations(a, b, fraction) {
-  const result = new Float32Array(a.length);
-  for (let i = 0; i < a.length; i += 4) {
+function mixRotationsInto(result, a, b, fraction) {
+  for (let i = 0; i < result.length; i += 4) {
     const dot = a[i] * b[i] + a[i + 1] * b[i + 1] + a[i + 2] * b[i + 2] + a[i + 3] * b[i + 3];
     const sign = dot < 0 ? -1 : 1;
     const w = mix(a[i], sign * b[i], fraction);

@@ -1,12 +1,14 @@
 /**
  * Evaluated splats as the words of Spark's PackedSplats (docs/formats/spark.md), in ranges fitted to the bundle.
  */
-import { evaluateRest } from "./evaluate.js";
+import { mix } from "./evaluate.js";
 
 const SH_C0 = 0.28209479177387814;
 const FLAT_LN_SCALE = -30;
 const TEXTURE_WIDTH = 2048;
 const TEXTURE_LAYER = TEXTURE_WIDTH * 2048;
+const BETWEEN = -1; // shown between two entries of a palette
+const NOTHING = -2;
 // Bits a value and words a splat of each band.
 export const BANDS = [
   { name: "sh1", first: 0, values: 9, bits: 7, words: 2 },
@@ -51,12 +53,19 @@ function spread(lowName, highName, values, low, high) {
   return found[0] < found[1] ? { [lowName]: found[0], [highName]: found[1] } : { [lowName]: low, [highName]: high };
 }
 
-/** Packs the splats of one bundle; what the palettes give is encoded once. */
+/** Packs the splats of one bundle; what the palettes give is encoded once, and written where it changes. */
 export class Packer {
   constructor(bundle) {
     this.bundle = bundle;
     this.encoding = fittedEncoding(bundle);
     this.entryWords = bundle.palettes.map((palette) => this.packPalette(palette));
+    const padded = paddedCount(bundle.splatCount);
+    this.packedArray = new Uint32Array(4 * padded);
+    this.extra = Object.fromEntries(
+      BANDS.slice(0, bundle.degree).map(({ name, words }) => [name, new Uint32Array(words * padded)]),
+    );
+    // What the words of each splat stand for: an entry of the palette, BETWEEN or NOTHING.
+    this.shown = bundle.palettes.map(() => new Int32Array(bundle.splatCount).fill(NOTHING));
   }
 
   /** Words of every entry of a palette, by band: a splat whose label does not change copies them. */
@@ -82,50 +91,79 @@ export class Packer {
    * Words for one displayed time.
    *
    * @param {object} state what `evaluate` returned
-   * @returns {{packedArray: Uint32Array, extra: Object<string, Uint32Array>}} padded to whole texture rows
+   * @returns {{packedArray: Uint32Array, extra: Object<string, Uint32Array>}} padded to whole texture rows, and written
+   *   again by the next call; of the bands those that changed
    */
   pack(state, a, b, fraction) {
-    const { count } = a;
-    const padded = paddedCount(count);
-    const packedArray = new Uint32Array(4 * padded);
-    packSplats(state, count, this.encoding, packedArray);
+    packSplats(state, a.count, this.encoding, this.packedArray);
     const extra = {};
-    let rest = null;
     this.bundle.palettes.forEach((palette, p) => {
-      const [from, to] = [a.labels[p], b.labels[p]];
-      this.bandsOf(palette).forEach((band, k) => {
-        const source = this.entryWords[p][k];
-        const words = new Uint32Array(band.words * padded);
-        for (let i = 0; i < count; i++) {
-          if (fraction === 0 || from[i] === to[i]) {
-            for (let w = 0; w < band.words; w++) words[band.words * i + w] = source[band.words * from[i] + w];
-          } else {
-            rest ??= evaluateRest(this.bundle.palettes, this.bundle.restCoefficients, a, b, fraction);
-            const at = 3 * this.bundle.restCoefficients * i + band.first;
-            encodeBand(rest, at, band, this.encoding[`${band.name}Max`], words, band.words * i);
-          }
-        }
-        extra[band.name] = words;
-      });
+      if (!this.packLabels(p, a.labels[p], fraction === 0 ? a.labels[p] : b.labels[p], fraction)) return;
+      for (const { name } of this.bandsOf(palette)) extra[name] = this.extra[name];
     });
-    return { packedArray, extra };
+    return { packedArray: this.packedArray, extra };
+  }
+
+  /** Write the words of the splats whose labels are not those that are shown; whether there were any. */
+  packLabels(p, from, to, fraction) {
+    const palette = this.bundle.palettes[p];
+    const shown = this.shown[p];
+    const width = 3 * palette.coefficients;
+    const bands = this.bandsOf(palette).map((band, k) => ({
+      ...band,
+      source: this.entryWords[p][k],
+      target: this.extra[band.name],
+      limit: this.encoding[`${band.name}Max`],
+      offset: band.first - 3 * palette.firstCoefficient,
+    }));
+    const mixed = new Float32Array(width);
+    let hasChanged = false;
+    for (let i = 0; i < shown.length; i++) {
+      const label = from[i] === to[i] ? from[i] : BETWEEN;
+      if (label === shown[i] && label !== BETWEEN) continue;
+      hasChanged = true;
+      shown[i] = label;
+      if (label === BETWEEN) {
+        const [first, second] = [width * from[i], width * to[i]];
+        for (let k = 0; k < width; k++) mixed[k] = mix(palette.values[first + k], palette.values[second + k], fraction);
+      }
+      for (const band of bands) {
+        const { source, target, words } = band;
+        const at = words * i;
+        if (label === BETWEEN) {
+          target.fill(0, at, at + words);
+          encodeBand(mixed, band.offset, band, band.limit, target, at);
+        } else {
+          for (let w = 0; w < words; w++) target[at + w] = source[words * label + w];
+        }
+      }
+    }
+    return hasChanged;
   }
 }
 
 /** Four words a splat. */
 export function packSplats({ means, logScales, quats, opacities, sh0 }, count, encoding, words) {
   const { rgbMin, rgbMax, lnScaleMin, lnScaleMax } = encoding;
-  const toByte = (value) => Math.min(255, Math.max(0, Math.round(value)));
-  const color = (value) => toByte(((SH_C0 * value + 0.5 - rgbMin) / (rgbMax - rgbMin)) * 255);
+  const bits = new Uint32Array(means.buffer, means.byteOffset, means.length);
+  const colorStep = (SH_C0 * 255) / (rgbMax - rgbMin);
+  const colorStart = ((0.5 - rgbMin) * 255) / (rgbMax - rgbMin) + 0.5; // half a step, so that cutting off rounds
+  const color = (value) => {
+    const code = colorStep * value + colorStart;
+    return code < 0 ? 0 : code > 255 ? 255 : code | 0;
+  };
   const steps = 254 / (lnScaleMax - lnScaleMin);
-  const scale = (log) =>
-    log < FLAT_LN_SCALE ? 0 : Math.min(255, Math.max(1, Math.round((log - lnScaleMin) * steps) + 1));
+  const scale = (log) => {
+    if (log < FLAT_LN_SCALE) return 0;
+    const code = (log - lnScaleMin) * steps + 1.5;
+    return code < 1 ? 1 : code > 255 ? 255 : code | 0;
+  };
   for (let i = 0, k = 0, q = 0; i < count; i++, k += 3, q += 4) {
     const rotation = packRotation(quats[q], quats[q + 1], quats[q + 2], quats[q + 3]);
     words[q] =
-      color(sh0[k]) | (color(sh0[k + 1]) << 8) | (color(sh0[k + 2]) << 16) | (Math.round(opacities[i] * 255) << 24);
-    words[q + 1] = toHalf(means[k]) | (toHalf(means[k + 1]) << 16);
-    words[q + 2] = toHalf(means[k + 2]) | ((rotation & 0xffff) << 16);
+      color(sh0[k]) | (color(sh0[k + 1]) << 8) | (color(sh0[k + 2]) << 16) | ((opacities[i] * 255 + 0.5) << 24);
+    words[q + 1] = halfOf(bits[k]) | (halfOf(bits[k + 1]) << 16);
+    words[q + 2] = halfOf(bits[k + 2]) | ((rotation & 0xffff) << 16);
     words[q + 3] =
       scale(logScales[k]) | (scale(logScales[k + 1]) << 8) | (scale(logScales[k + 2]) << 16) | ((rotation >> 16) << 24);
   }
@@ -139,8 +177,8 @@ function packRotation(w, x, y, z) {
     y = -y;
     z = -z;
   }
-  const angle = Math.round((2 * Math.acos(Math.min(w, 1)) * 255) / Math.PI);
-  if (Math.sqrt(x * x + y * y + z * z) < 1e-6) {
+  const angle = ((2 * Math.acos(w < 1 ? w : 1) * 255) / Math.PI + 0.5) | 0;
+  if (x * x + y * y + z * z < 1e-12) {
     x = 1;
     y = z = 0;
   }
@@ -152,7 +190,7 @@ function packRotation(w, x, y, z) {
     py = (1 - Math.abs(px)) * (py < 0 ? -1 : 1);
     px = folded;
   }
-  return Math.round((px / 2 + 0.5) * 255) | (Math.round((py / 2 + 0.5) * 255) << 8) | (angle << 16);
+  return (((px / 2 + 0.5) * 255 + 0.5) | 0) | ((((py / 2 + 0.5) * 255 + 0.5) | 0) << 8) | (angle << 16);
 }
 
 /** Values of a band from `at` on, as signed codes one after another in a string of words. */
@@ -168,22 +206,17 @@ function encodeBand(source, at, { values, bits }, limit, words, target) {
   }
 }
 
-const float = new Float32Array(1);
-const float32Bits = new Uint32Array(float.buffer);
-
-/** Bits of the nearest half, ties to even. */
-export function toHalf(value) {
-  float[0] = value;
-  const bits = float32Bits[0];
+/** Bits of the half that is nearest to a float32 given by its bits, ties to even. */
+export function halfOf(bits) {
   const sign = (bits >>> 16) & 0x8000;
   const magnitude = bits & 0x7fffffff;
   if (magnitude >= 0x47800000) return sign | (magnitude > 0x7f800000 ? 0x7e00 : 0x7c00);
-  if (magnitude < 0x38800000) {
-    const scaled = Math.abs(value) * 2 ** 24; // subnormal halves are multiples of 2^-24
-    const below = Math.floor(scaled);
-    const rest = scaled - below;
-    return sign | (below + (rest > 0.5 || (rest === 0.5 && below & 1) ? 1 : 0));
-  }
-  const rounded = magnitude + 0xfff + ((magnitude >> 13) & 1);
-  return sign | Math.min(0x7c00, (rounded - 0x38000000) >> 13);
+  if (magnitude >= 0x38800000) return sign | ((magnitude + 0xfff + ((magnitude >> 13) & 1) - 0x38000000) >> 13);
+  if (magnitude <= 0x33000000) return sign; // up to half of the smallest subnormal half, 2^-24
+  const shift = 126 - (magnitude >> 23);
+  const significand = (magnitude & 0x7fffff) | 0x800000;
+  const below = significand >> shift;
+  const rest = significand & ((1 << shift) - 1);
+  const middle = 1 << (shift - 1);
+  return sign | (below + (rest > middle || (rest === middle && below & 1) ? 1 : 0));
 }

@@ -6,6 +6,7 @@ import { paddedCount } from "./pack.js";
 
 const MOST_DECODERS = 4;
 const KEYFRAMES_AHEAD = 6;
+const KEYFRAMES_BEHIND = 2;
 
 export class Player {
   /** Open a bundle from a Blob. */
@@ -62,14 +63,30 @@ export class Player {
     });
   }
 
+  /** Normalized time of each keyframe. */
+  get keyTimes() {
+    return this.times ?? Array.from({ length: this.frameCount }, (_, k) => k / Math.max(1, this.frameCount - 1));
+  }
+
   /** Bring the mesh to a normalized time; resolves once its arrays are those of that time. */
   async show(t, interpolation = "linear") {
-    const { packedArray, extra, decoded } = await this.call({ type: "show", t, interpolation, ahead: KEYFRAMES_AHEAD });
+    const around = { ahead: KEYFRAMES_AHEAD, behind: KEYFRAMES_BEHIND };
+    const { packedArray, extra, decoded } = await this.call({ type: "show", t, interpolation, ...around });
     this.decoded = decoded;
     this.splats.packedArray.set(packedArray);
-    for (const [name, words] of Object.entries(extra)) this.splats.extra[name] = words;
+    for (const [name, words] of Object.entries(extra)) this.replaceBand(name, words);
     this.splats.needsUpdate = true;
     this.mesh.updateVersion();
+  }
+
+  /** Spark makes the texture of a band once, from the array that is there then: later words go into that array. */
+  replaceBand(name, words) {
+    const { extra } = this.splats;
+    const texture = extra[`${name}Texture`]?.value;
+    if (texture) {
+      extra[name].set(words);
+      texture.needsUpdate = true;
+    } else extra[name] = words;
   }
 
   dispose() {

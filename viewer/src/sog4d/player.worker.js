@@ -15,6 +15,7 @@ let decoded = 0;
 const cache = new Map(); // frame -> promise of a keyframe, least recently used first
 const waiting = new Map(); // key -> {resolve, reject}
 let nextPort = 0;
+const room = {}; // arrays of the evaluation, written again for every picture
 
 onmessage = async ({ data }) => {
   const { id, type } = data;
@@ -39,12 +40,16 @@ const handlers = {
   },
 
   /** Words for a time, and a start on the keyframes that come next. */
-  async show({ t, interpolation, ahead }) {
+  async show({ t, interpolation, ahead, behind }) {
     const [a, b, fraction] = await bracketed(t, interpolation);
-    for (let k = 1; k <= ahead; k++) prefetch((b.frame + k) % bundle.frameCount);
-    const { packedArray, extra } = packer.pack(evaluate(a, b, fraction), a, b, fraction);
-    const buffers = [packedArray, ...Object.values(extra)].map(({ buffer }) => buffer);
-    return [{ packedArray, extra, decoded, frames: [a.frame, b.frame, fraction] }, buffers];
+    const { frameCount } = bundle;
+    const spare = Math.min(cacheFrames, frameCount) - 2; // what is fetched must not push out what is shown
+    const later = Math.min(ahead, spare);
+    const earlier = Math.min(behind, spare - later);
+    for (let k = 1; k <= later; k++) prefetch((b.frame + k) % frameCount);
+    for (let k = 1; k <= earlier; k++) prefetch((a.frame - k + frameCount) % frameCount);
+    const { packedArray, extra } = packer.pack(evaluate(a, b, fraction, room), a, b, fraction);
+    return [{ packedArray, extra, decoded }, []];
   },
 
   /** The evaluated values themselves, for comparison with the Python evaluation. */
