@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_tools.chunks import CloudChunks
-from gsplat_tools.errors import GsplatWarning
+from gsplat_tools.errors import GsplatError, GsplatWarning
 from gsplat_tools.formats.loading import drop_or_refuse
 from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target
 from gsplat_tools.formats.sequences import open_sources
+from gsplat_tools.ops.coordinates import name_axes
 from gsplat_tools.retiming import DEFAULT_MOTION, Motion, retime
 from gsplat_tools.sequence import GaussianSequence, Interpolation
 from gsplat_tools.tuning.measuring import Setting
@@ -63,14 +64,19 @@ def estimate(
             scene, _ = retime(opened, record, motion, time_at, frame, interpolation, options)
             cloud = scene.read() if isinstance(scene, CloudChunks) else scene
             valid = cloud if isinstance(cloud, GaussianSequence) else drop_or_refuse(cloud, strict=False)
+            valid = name_axes(valid, options.get("source_coordinates"))
             if options.get("clip") == "rendered":
                 options["clip"] = rendered_clip(valid, options)
-            found = predict(
-                valid,
-                Setting(format=record.id, preset=preset, options=options),
-                views=0 if validation is None else validation.views,
-                size=VALIDATION_SIZE if validation is None else validation.size,
-            )
+            try:
+                found = predict(
+                    valid,
+                    Setting(format=record.id, preset=preset, options=options),
+                    views=0 if validation is None else validation.views,
+                    size=VALIDATION_SIZE if validation is None else validation.size,
+                )
+            except GsplatError as error:
+                error.path = Path(target)  # not the trial in a temporary folder
+                raise
     return {
         "source": ", ".join(map(str, sources)),
         "source_format": source_format,

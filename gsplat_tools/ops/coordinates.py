@@ -18,8 +18,27 @@ from gsplat_tools.attributes.coordinate_systems import (
 )
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CloudError
+from gsplat_tools.sequence import GaussianSequence
 
 _NORMALS = ("nx", "ny", "nz")
+
+
+def name_axes(scene: GaussianCloud | GaussianSequence, axes: str | None) -> GaussianCloud | GaussianSequence:
+    """Return a scene that says what its axes are; no number changes.
+
+    Parameters
+    ----------
+    scene
+        A cloud, or frames.
+    axes
+        Axis letters, in place of what the scene says; None leaves it.
+    """
+    if axes is None:
+        return scene
+    name = axes.upper()
+    if isinstance(scene, GaussianSequence):
+        return scene.map(lambda cloud: cloud.replace(coordinate_system=name))
+    return scene.replace(coordinate_system=name)
 
 
 def convert_coordinates(cloud: GaussianCloud, target: str, source: str | None = None) -> GaussianCloud:

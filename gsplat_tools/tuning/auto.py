@@ -13,6 +13,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import GsplatError, ValidationError
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import drop_or_refuse
+from gsplat_tools.ops.coordinates import name_axes
 from gsplat_tools.sequence import GaussianSequence
 from gsplat_tools.tuning.measuring import Model, Workbench
 from gsplat_tools.tuning.search import TARGET_SIZE, TARGET_VIEWS, Budget, Found, Searcher
@@ -88,6 +89,7 @@ def tune(
     if budget is None:
         whole, decisions = without_what_never_changes(whole)
     valid = whole if isinstance(whole, GaussianSequence) else drop_or_refuse(whole, strict=bool(options.get("strict")))
+    valid = name_axes(valid, options.get("source_coordinates"))
     searcher = Searcher(valid, record, preset=preset, pinned=options, views=views, size=size, model=model)
     tuned = Tuned(scene=whole, decisions=decisions, bench=searcher.whole.bench)
     if not searcher.whole.bench.shows_anything(searcher.whole.bench.model_of(record)):

@@ -6,6 +6,7 @@ from click.testing import CliRunner, Result
 
 from gsplat_tools.cli._tuning import knob_table
 from gsplat_tools.cli.convert import main
+from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.formats import load, save
 from gsplat_tools.ops.sampling import crop
 
@@ -16,6 +17,15 @@ ROOT = Path(__file__).parents[2]
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "scene.ply"
     save(crop(load(ROOT / "fixtures" / "garden.ply"), 400), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene_without_axes(scene: Path) -> Path:
+    path = scene.with_name("unknown.ply")
+    cloud = load(scene)
+    assert isinstance(cloud, GaussianCloud)
+    save(cloud.replace(coordinate_system="unknown"), path)
     return path
 
 
@@ -77,3 +87,25 @@ def test_clip_by_rendering__comes_before_estimates_and_searches(options: list[ob
     report = json.loads(result.stdout)
     assert (report["bytes"] if "--dry-run" in options else report["target"]["bytes"]) > 17 * 300
     assert report.get("options", {}).get("clip") != "rendered"
+
+
+@pytest.mark.parametrize("options", [["--dry-run"], ["--max-bytes", 10**6, "--views", 1]], ids=str)
+def test_axes__of_the_source_that_are_given_hold_for_estimates_and_searches(
+    options: list[object], scene_without_axes: Path, tmp_path: Path
+) -> None:
+    scene = scene_without_axes
+    axes = ["--source-coordinates", "RDF", "--target-coordinates", "RUB"]
+    target = tmp_path / "a.spz"
+
+    plain = json.loads(run(scene, target, *options, "--json", "--quiet", "--overwrite").stdout)
+    turned = json.loads(run(scene, target, *options, *axes, "--json", "--quiet", "--overwrite").stdout)
+
+    levels = [report["psnr_min"] if "psnr_min" in report else report["validation"]["psnr_min"] for report in (plain, turned)]
+    assert abs(levels[0] - levels[1]) < 3
+
+
+def test_dry_run__names_the_target_in_errors(scene_without_axes: Path, tmp_path: Path) -> None:
+    result = run(scene_without_axes, tmp_path / "a.spz", "--dry-run", "--target-coordinates", "RUB")
+
+    assert result.exit_code == 1
+    assert f"{tmp_path / 'a.spz'}, coordinate_system: " in result.stderr
