@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsplat_tools.errors import CapabilityError, CloudError, GsplatWarning
+from gsplat_tools.errors import CapabilityError, CloudError, FormatError, GsplatWarning
 from gsplat_tools.formats import load
 from gsplat_tools.formats.sog4d import Sog4dReadOptions, inspect, planes, read
 from gsplat_tools.sequence import GaussianSequence
@@ -191,6 +191,14 @@ def test_planes__are_the_raw_bytes(tmp_path: Path) -> None:
     assert images["shN_labels"].reshape(-1, 4)[:SPLATS, 0].tolist() == LABELS[1]
     with pytest.raises(CloudError, match=r"0\.\.2"):
         planes(path, 3)
+
+
+def test_planes__of_a_broken_bundle_name_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.sog4d"
+    path.write_bytes(valid_bundle()[:-30])
+
+    with pytest.raises(FormatError, match=r"a\.sog4d"):
+        planes(path, 0)
 
 
 def test_load__keeps_the_file_open_for_later_frames(tmp_path: Path) -> None:

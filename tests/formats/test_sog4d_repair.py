@@ -48,6 +48,15 @@ def test_normalize__makes_a_legacy_bundle_valid_and_keeps_what_it_shows(tmp_path
             assert np.array_equal(values, getattr(repaired.frame(frame), name)), name
 
 
+def test_normalize__keeps_halves_of_surrogate_pairs_escaped(tmp_path: Path) -> None:
+    (tmp_path / "old.sog4d").write_bytes(archive({**valid_meta(), "generator": "é\ud800", "comment": None}, valid_files()))
+
+    normalize(tmp_path / "old.sog4d", tmp_path / "new.sog4d")
+
+    with zipfile.ZipFile(tmp_path / "new.sog4d") as bundle:
+        assert json.loads(bundle.read("meta.json"))["generator"] == "é\ud800"
+
+
 def test_normalize__in_place_replaces_the_file_as_a_whole(tmp_path: Path) -> None:
     path = tmp_path / "old.sog4d"
     path.write_bytes(legacy_bundle())

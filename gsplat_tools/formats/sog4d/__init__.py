@@ -53,7 +53,9 @@ def planes(path: str | Path, frame: int) -> dict[str, Image]:
     CloudError
         There is no such frame.
     """
-    with Path(path).open("rb") as stream:
+    from gsplat_tools.formats.loading import located  # which imports all formats
+
+    with located(Path(path)), Path(path).open("rb") as stream:
         bundle = Bundle(stream)
         if not 0 <= frame < bundle.meta.frame_count:
             raise CloudError(f"expected a frame in 0..{bundle.meta.frame_count - 1}, found {frame}", path=path, frame=frame)

@@ -46,7 +46,7 @@ def repair(source: BinaryIO, target: BinaryIO) -> list[str]:
     if not isinstance(root, dict):
         raise CorruptDataError(f"expected a JSON object, found {type(root).__name__}", field="meta.json")
     changes = _respell(root)
-    data = json.dumps(root, separators=(",", ":"), ensure_ascii=False).encode()
+    data = json.dumps(root, separators=(",", ":")).encode()  # escaped: halves of surrogate pairs have no UTF-8
     raise_errors(parse_meta(data)[1], RULES)
     num_doubles = len(archive.issues)
     if num_doubles:
