@@ -66,7 +66,6 @@ class Part:
     tally: AttributeTally | None = None
     views: list[ViewReport] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
-    source_bytes: int = 0
     kept: bool = False
 
     def to_json(self) -> dict[str, Any]:
@@ -83,7 +82,6 @@ class Part:
             "tally": None if self.tally is None else {name: asdict(each) for name, each in self.tally.attributes.items()},
             "views": [asdict(view) for view in self.views],
             "seconds": self.seconds,
-            "source_bytes": self.source_bytes,
         }
 
 
@@ -108,7 +106,6 @@ def part_from_json(path: str, said: dict[str, Any]) -> Part:
         tally=tally,
         views=[ViewReport(**view) for view in said["views"]],
         seconds=said["seconds"],
-        source_bytes=said["source_bytes"],
         kept=True,
     )
 

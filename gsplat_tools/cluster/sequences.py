@@ -217,6 +217,9 @@ class _Job:
     def fit(self) -> tuple[Kept, Any, Any]:
         """Return which splats stay, and the tasks that fit frames and codebooks."""
         self.identities = self._over_frames("identify", "looking for frames", tasks.identify_frames)
+        source_bytes = sum(int(each.split()[0]) for each in self.identities)
+        for name, passes in (("look", 1), ("fit", 1), ("encode", 1 if self.checks is None else 2)):
+            self.stages.note(name, bytes_read=passes * source_bytes)
         facts = self._over_frames("look", "checking frames", tasks.look_at_frames, self.choices)
         kept = kept_splats(facts, self.source.first.splats, self.choices)
         if not kept.keeps.any():
@@ -252,7 +255,7 @@ class _Job:
         for part in found:
             seconds = {} if part.kept else {f"{name}_seconds": spent for name, spent in part.seconds.items()}
             end = max(entry.offset + entry.stored_size for entry in part.entries)
-            self.stages.note("encode", source_bytes=part.source_bytes, part_bytes=end, **seconds)
+            self.stages.note("encode", bytes_written=end, **seconds)
         return found
 
     def _over_frames(self, name: str, label: str, function: Callable[..., Any], *arguments: Any) -> list[Any]:

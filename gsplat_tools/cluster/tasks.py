@@ -17,10 +17,9 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.cluster.checking import CheckedSegment, Checks
 from gsplat_tools.cluster.parts import Part, read_part, write_part
 from gsplat_tools.errors import ReadError, WriteError
-from gsplat_tools.formats._files import open_source_file, reason
+from gsplat_tools.formats._files import reason
 from gsplat_tools.formats._limits import use_max_memory
 from gsplat_tools.formats._stores import identity
-from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats._zip import ZipWriter
 from gsplat_tools.formats.base import FileInfo
 from gsplat_tools.formats.loading import inspect_file
@@ -174,7 +173,6 @@ def encode_segment(
                 tally=alone.tally,
                 views=alone.views,
                 seconds={"read": reading, "encode": encoded - start - reading, "validate": checked - encoded},
-                source_bytes=sum(size_of(each) for each in source.files[segment[0] : sum(segment)]),
             )
             write_part(part, body)
     except OSError as error:
@@ -198,10 +196,3 @@ class _Timed:
         cloud = self._frames[frame_id]
         self.seconds += time.perf_counter() - start
         return cloud
-
-
-def size_of(path: str) -> int:
-    """Return the bytes of a file or an object."""
-    stream = open_source_file(Path(path))
-    with stream:
-        return stream_size(stream)
