@@ -119,6 +119,11 @@ def _takes(record: Format, flag: str, name: str) -> bool:
     "--sh-degree", type=options.DegreeType(), help="Highest SH band to keep; auto drops bands that are zero everywhere."
 )
 @click.option("--prune-opacity", type=options.FiniteType(0, 1), help="Drop splats of lower opacity; 0 prunes nothing.")
+@click.option(
+    "--outliers",
+    type=click.Choice(["auto", "keep", "drop"]),
+    help="Far splats that hardly show and stretch the box; auto drops them with a visual tolerance.",
+)
 @click.option("--order", type=click.Choice(["morton", "hilbert2d", "none"]), help="Order of splats; none keeps the source's.")
 @click.option(
     "--source-coordinates",

@@ -38,6 +38,9 @@ class SaveChoices:
         where the target is lossless.
     prune_opacity
         Splats with a lower opacity are dropped; 0 prunes nothing.
+    outliers
+        "drop" leaves out far splats that hardly show where they stretch the box (`ops.outliers`), of still scenes; "auto"
+        does so with a visual tolerance.
     order
         "morton", "hilbert2d" or "none"; by default what suits the format.
     source_coordinates
@@ -52,6 +55,7 @@ class SaveChoices:
 
     sh_degree: int | Literal["auto"] | None = None
     prune_opacity: float = 0.0
+    outliers: Literal["auto", "keep", "drop"] = "auto"
     order: Literal["morton", "hilbert2d", "none"] | None = None
     source_coordinates: str | None = None
     target_coordinates: str | None = None
@@ -59,7 +63,12 @@ class SaveChoices:
     strict: bool = False
 
     def __post_init__(self) -> None:
-        choices = {"order": (None, "morton", "hilbert2d", "none"), "recenter": ("auto", "on", "off"), "strict": (True, False)}
+        choices = {
+            "order": (None, "morton", "hilbert2d", "none"),
+            "outliers": ("auto", "keep", "drop"),
+            "recenter": ("auto", "on", "off"),
+            "strict": (True, False),
+        }
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise CapabilityError(f"{name} must be one of {', '.join(map(str, known))}, got {getattr(self, name)!r}")
@@ -150,8 +159,13 @@ def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
         scene = scene.frame(0)
     order = choices.order or target.order
     in_one = not target.streams or order != "none"
+    num_outliers = 0
+    if choices.outliers == "drop":
+        scene, num_outliers = _without_outliers(scene, choices)
     chunks = as_chunks(scene, max(len(scene), 1)) if in_one else as_chunks(scene)
     scan = _scan(chunks, choices)
+    if num_outliers:
+        scan.dropped["outliers"] += num_outliers
     fit = Fit(chunks.template, target, choices, scan)
     prepared = chunks.map(fit, num_splats=scan.num_kept)
     if not in_one:
@@ -162,6 +176,24 @@ def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
 
         cloud = cloud.take(splat_order(cloud, order))
     return Prepared(cloud, dict(scan.dropped))
+
+
+def _without_outliers(scene: GaussianCloud | CloudChunks, choices: SaveChoices) -> tuple[GaussianCloud | CloudChunks, int]:
+    """Leave out far splats that hardly show, which is told from all splats that are written."""
+    from gsplat_tools.attributes.activations import sigmoid
+    from gsplat_tools.ops.filtering import classify_invalid
+    from gsplat_tools.ops.outliers import find_outliers
+
+    cloud = scene if isinstance(scene, GaussianCloud) else scene.read()
+    written, _ = classify_invalid(cloud)
+    if choices.prune_opacity > 0:
+        written = written & (sigmoid(cloud.opacity_logits) >= choices.prune_opacity)
+    outliers = np.flatnonzero(written)[find_outliers(cloud.take(written))]
+    if len(outliers) == 0:
+        return scene, 0
+    stays = np.ones(len(cloud), np.bool_)
+    stays[outliers] = False
+    return cloud.take(stays), len(outliers)
 
 
 def _scan(chunks: CloudChunks, choices: SaveChoices) -> Scan:

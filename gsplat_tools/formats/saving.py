@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -133,7 +133,10 @@ def split_options(record: Format, preset: str, options: dict[str, Any]) -> tuple
         raise CapabilityError(f"unknown preset {preset!r}; {record.title} has {', '.join(record.presets)}")
     chosen = {**record.presets.get(preset, {}), **options}
     choices = SaveChoices(**{name: value for name, value in chosen.items() if name in general})
-    return choices, record.write_options(**{name: value for name, value in chosen.items() if name in own})
+    written = record.write_options(**{name: value for name, value in chosen.items() if name in own})
+    if choices.outliers == "auto":
+        choices = replace(choices, outliers="drop" if getattr(written, "visual_tolerance", 0) > 0 else "keep")
+    return choices, written
 
 
 def check_header(stream: BinaryIO, record: Format, scene: Scene) -> None:

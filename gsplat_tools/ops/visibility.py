@@ -184,9 +184,7 @@ def visible_costs(cloud: GaussianCloud, log_scales: NDArray[np.float32], pixels:
 
     scale = view.pixels_per_unit(cloud.means)
     opacities = sigmoid(cloud.opacity_logits.astype(np.float64))
-    with np.errstate(divide="ignore"):
-        logs = np.clip(log_scales + np.log(scale)[:, None], -_MAX_LOG, _MAX_LOG)
-    variances = np.exp(2 * logs.astype(np.float64)) + LOW_PASS
+    variances = _variances(log_scales, scale)
     ordered = np.sort(variances, axis=1)
     area = np.pi * np.sqrt(ordered[:, 2] * ordered[:, 1])
     bit = np.pi / 2 * pixels**2
@@ -207,6 +205,21 @@ def visible_costs(cloud: GaussianCloud, log_scales: NDArray[np.float32], pixels:
         "harmonics": color / (4 * np.pi),
     }
     return VisibleCosts(**{name: np.maximum(values, _MIN_COST) for name, values in costs.items()})
+
+
+def trace_areas(cloud: GaussianCloud, log_scales: NDArray[np.float32], view: Viewpoint) -> Float64:
+    """Return pi a b of the largest trace of each splat, (N,) px^2: the integral of exp(-r^2)."""
+    ordered = np.sort(_variances(log_scales, view.pixels_per_unit(cloud.means)), axis=1)
+    area: Float64 = np.pi * np.sqrt(ordered[:, 2] * ordered[:, 1])
+    return area
+
+
+def _variances(log_scales: NDArray[np.float32], scale: Float64) -> Float64:
+    """Return the variances of traces along the three axes, (N, 3) px^2."""
+    with np.errstate(divide="ignore"):
+        logs = np.clip(log_scales + np.log(scale)[:, None], -_MAX_LOG, _MAX_LOG)
+    variances: Float64 = np.exp(2 * logs.astype(np.float64)) + LOW_PASS
+    return variances
 
 
 def allowed_error(costs: Float64) -> Float64:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,13 @@ from gsplat_tools.ops.coordinates import name_axes
 from gsplat_tools.sequence import GaussianSequence
 from gsplat_tools.tuning.measuring import Model, Workbench
 from gsplat_tools.tuning.search import TARGET_SIZE, TARGET_VIEWS, Budget, Found, Searcher
-from gsplat_tools.tuning.trials import Trial
+from gsplat_tools.tuning.trials import Trial, Trials
 
 VISIBLE_PSNR = 20 * float(np.log10(255))
 """48.13 dB: the root mean square error of a picture is one step of 8 bits, below which a screen shows next to nothing."""
+
+_EQUAL_DB = 0.01
+"""Less than this is no loss."""
 
 Decision = dict[str, Any]
 """What was decided: "option", "value", "bytes_saved", "db_lost" (None where nothing was measured) and "why"."""
@@ -84,7 +87,7 @@ def tune(
     GsplatError
         The format cannot hold the scene.
     """
-    whole = scene.read() if isinstance(scene, CloudChunks) else scene
+    given = whole = scene.read() if isinstance(scene, CloudChunks) else scene
     decisions: list[Decision] = []
     if budget is None:
         whole, decisions = without_what_never_changes(whole)
@@ -100,11 +103,74 @@ def tune(
         tuned.decisions += [_of_search(each) for each in tuned.found.decisions]
         return tuned
     usual = searcher.whole.encode({})
+    if decisions:
+        _measure_bytes(decisions, Trials(Workbench(given), record, preset, options), usual)
+    chosen, alternatives = _alternatives(searcher.whole, valid, usual)
+    tuned.decisions += alternatives
+    if chosen:
+        pinned = {**options, **chosen}
+        searcher = Searcher(valid, record, preset=preset, pinned=pinned, views=views, size=size, model=model)
+        usual, tuned.options = searcher.whole.encode({}), chosen
     found = searcher.find(Budget(min_psnr=min(usual.level, VISIBLE_PSNR)))
     if found.bytes < usual.bytes:
-        tuned.found, tuned.options = found, dict(found.options)
+        tuned.found, tuned.options = found, {**chosen, **found.options}
         tuned.decisions += _against_preset(searcher, usual, found)
     return tuned
+
+
+def _measure_bytes(decisions: list[Decision], before: Trials, after: Trial) -> None:
+    """Enter what leaving out unchanging fields or frames saves in the file; pictures stay what they were."""
+    try:
+        saved = before.encode({}, draw=False).bytes - after.bytes
+    except GsplatError:
+        return  # the target cannot hold them
+    for each in decisions:
+        each["bytes_saved"] = saved
+
+
+def _alternatives(
+    trials: Trials, scene: GaussianCloud | GaussianSequence, usual: Trial
+) -> tuple[dict[str, Any], list[Decision]]:
+    """Hold choices that are no knobs against what else there is; return those to change, and all as decisions."""
+    chosen: dict[str, Any] = {}
+    decisions = list[Decision]()
+    for name, other, why in _others(trials, scene):
+        try:
+            trial = trials.encode({name: other})
+        except GsplatError:
+            continue
+        if (trial.bytes, trial.level) == (usual.bytes, usual.level):
+            continue
+        changes = trial.bytes <= usual.bytes and trial.level >= usual.level - _EQUAL_DB
+        first, second = (usual, trial) if changes else (trial, usual)
+        if changes:
+            chosen[name] = other
+        lost = first.level - second.level
+        decisions.append({
+            "option": name,
+            "value": other if changes else f"not {other}",
+            "bytes_saved": first.bytes - second.bytes,
+            "db_lost": round(lost, 3) if np.isfinite(lost) else None,
+            "why": f"{why}; measured against {'what was' if changes else other}",
+        })  # fmt: skip
+    return chosen, decisions
+
+
+def _others(trials: Trials, scene: GaussianCloud | GaussianSequence) -> list[tuple[str, Any, str]]:
+    """Return options that are no knobs with the value that their default is held against, where that may matter."""
+    from gsplat_tools.ops.outliers import find_outliers
+
+    record, others = trials.record, list[tuple[str, Any, str]]()
+    if "outliers" not in trials.fixed and isinstance(scene, GaussianCloud):
+        count = int(np.count_nonzero(find_outliers(scene)))
+        if count:
+            others.append(("outliers", "drop", f"{count} far splats that hardly show stretch the box"))
+    if "recenter" not in trials.fixed and record.position_type == "f16":
+        others.append(("recenter", "off", "positions are halves, finest near the origin"))
+    has_centroids = any(each.name == "centroids" for each in fields(record.write_options))
+    if has_centroids and "centroids" not in {*trials.fixed, *record.knobs} and scene.sh_degree > 0:
+        others.append(("centroids", "f32", "centroids of SH lie on a grid that halves hold"))
+    return others
 
 
 def _of_search(decision: Mapping[str, Any]) -> Decision:

@@ -257,8 +257,8 @@ class _Hunt:
     def run(self, advance: Callable[[int], None]) -> tuple[Choice, Trial]:
         """Return the best choice that holds."""
         best: tuple[Choice, Trial] | None = None
-        margin = 0.0
         for _ in range(_LARGE_ROUNDS if self._is_large else _ROUNDS):
+            margin = 0.0
             choice = self._propose(margin)
             for _ in range(_REPEATS):
                 if choice is None or choice.places not in self._verified or (best and choice.places == best[0].places):
@@ -300,6 +300,12 @@ class _Hunt:
             if self._is_large and trial.bytes > limit:
                 break
         return None if chosen is None else self._coarser(*chosen)
+
+    def _presets(self) -> list[Trial]:
+        """Encode and draw all presets that the format can hold the scene with."""
+        changes = (each for name, each in self._whole.record.presets.items() if name != _EXACT)
+        tried = (self._try({k: v for k, v in each.items() if k not in self._whole.fixed}, np.inf) for each in changes)
+        return [trial for trial in tried if trial is not None]
 
     def _try(self, options: dict[str, Any], limit: float) -> Trial | None:
         """Encode the whole scene, and draw it if it is no larger than a limit; None where the format cannot hold it."""
@@ -375,9 +381,10 @@ class _Hunt:
             if self._holds(trial):
                 return finest, trial
             if trial.level < wanted:
+                best = max((trial, *self._presets()), key=lambda each: (each.level, -each.bytes))
                 raise ValidationError(
-                    f"no setting of {self._whole.record.title} reaches {wanted:g} dB: the finest has {trial.level:.2f} dB in "
-                    f"the worst view at {trial.bytes} bytes; the target is left as it was. Ask for less, or take another format"
+                    f"no setting of {self._whole.record.title} reaches {wanted:g} dB: the finest has {best.level:.2f} dB in "
+                    f"the worst view at {best.bytes} bytes; the target is left as it was. Ask for less, or take another format"
                 )
             cheapest = self._cheapest(wanted)
             raise ValidationError(

@@ -9,7 +9,7 @@ from gsplat_tools.formats import load, save
 from gsplat_tools.formats.registry import find_format
 from gsplat_tools.ops.sampling import crop
 from gsplat_tools.sequence import GaussianSequence
-from gsplat_tools.tuning.auto import without_what_never_changes
+from gsplat_tools.tuning.auto import tune, without_what_never_changes
 from gsplat_tools.tuning.measuring import Workbench
 from gsplat_tools.tuning.search import Budget, Searcher, turnable
 
@@ -108,3 +108,42 @@ def test_auto__drops_motion_that_moves_nothing_and_frames_that_are_the_same(scen
     assert not without_what_never_changes(still)[0].has_motion
     assert without_what_never_changes(late) == (late, [])
     assert len(without_what_never_changes(frames)[0]) == 1
+
+
+def test_auto__holds_choices_that_are_no_knobs_against_what_else_there_is(scene: GaussianCloud) -> None:
+    count = len(scene)
+    means, logits = scene.means.copy(), scene.opacity_logits.copy()
+    center = np.median(means, axis=0)
+    means[0], logits[0] = center + 40 * (means.max(axis=0) - center), -7.0
+    still = scene.replace(
+        means=means,
+        opacity_logits=logits,
+        velocities=np.zeros((count, 3), np.float32),
+        times=np.zeros(count, np.float32),
+        durations=np.ones(count, np.float32),
+    )
+    tuned = tune(still, find_format("compressed-ply"), preset="balanced", options={}, size=(64, 36))
+    decisions = {each["option"]: each for each in tuned.decisions}
+
+    assert decisions["outliers"]["value"] == "drop" == tuned.options["outliers"]
+    assert decisions["outliers"]["bytes_saved"] > 0 >= decisions["outliers"]["db_lost"] - 0.01
+    kept = tune(still, find_format("compressed-ply"), preset="balanced", options={"outliers": "keep"}, size=(64, 36))
+    assert "outliers" not in {each["option"] for each in kept.decisions}
+
+    moving = tune(still, find_format("ply"), preset="balanced", options={}, size=(64, 36))
+    assert next(each for each in moving.decisions if each["option"] == "motion")["bytes_saved"] >= count * 5 * 4
+
+
+def test_preset__is_taken_a_step_coarser_where_the_search_finds_nothing_smaller(scene: GaussianCloud, monkeypatch) -> None:
+    searcher = Searcher(scene, find_format("spz"), size=(64, 36))
+    reached = searcher.whole.encode({})
+    monkeypatch.setattr("gsplat_tools.tuning.search._Hunt.run", _fail)
+    found = searcher.find(Budget(min_psnr=reached.level - 0.5))
+
+    assert found.bytes < reached.bytes
+    assert found.psnr_min >= reached.level - 0.5
+    assert found.decisions[0]["stream"].startswith("preset")
+
+
+def _fail(*_: object) -> None:
+    raise ValidationError("nothing")
