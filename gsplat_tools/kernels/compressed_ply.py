@@ -205,7 +205,10 @@ def encode_sh(shN, codes, counts):
                 value = np.float64(shN[i, k, c]) * 32.0 + 128.0
                 counts[INVALID] += not abs(value) < 1e300
                 counts[SH] += (value < -0.5) | (value > 256.5)
-                code = min(max(np.floor(value), 1.0), 254.0)
+                code = np.floor(value)
+                # Halfway, as 0 is: up and down in turn, or scenes with many zeros would be tinted.
+                code -= (code == value) & ((i + c + k) & 1)
+                code = min(max(code, 1.0), 254.0)
                 # The ends stand for 0 and 256, their neighbors for 1.5 and 254.5.
                 code = 0.0 if value < 0.75 else (255.0 if value > 255.25 else code)
                 codes[i, c * num_rest + k] = np.uint8(code)

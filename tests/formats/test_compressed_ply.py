@@ -241,6 +241,14 @@ def test_written_words__are_those_of_the_specification():
     assert words[:, 3].tolist() == [128, 255 << 24 | 255 << 16 | 255 << 8 | 255, 128 << 24 | 64 << 16 | 128 << 8]
 
 
+def test_sh__of_zeros_goes_up_and_down_in_turn():
+    decoded = read(write(mild_cloud(512, sh_degree=2).replace(shN=np.zeros((512, 8, 3)))))
+
+    np.testing.assert_array_equal(np.abs(decoded.shN), np.full((512, 8, 3), 1 / 64, np.float32))
+    assert (decoded.shN.sum(axis=0) == 0).all()
+    assert (decoded.shN.sum(axis=1) == 0).all()
+
+
 def test_sh__is_stored_as_the_nearest_value_that_readers_know():
     values = np.linspace(-4.2, 4.2, 3 * 3001).reshape(3001, 1, 3)
     cloud = mild_cloud(3001, sh_degree=1).replace(shN=np.repeat(values, 3, axis=1))
