@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from random import Random
 
 from tests.hostile.corpus import seeds_of
@@ -51,22 +52,30 @@ def make_mutant(format_id: str, index: int) -> Case:
 
 def _sealed(seed: Seed) -> Iterator[tuple[str, bytes]]:
     """Yield the systematic cases of a seed, its relatives first."""
+    yield from seed.named()
     yield from seed.relatives()
     for what, data in systematic(seed):
         yield what, seed.seal(data)
 
 
+def _unsealed(seed: Seed) -> Iterator[tuple[str, bytes]]:
+    """Yield as many as `_sealed` does, without the work of sealing."""
+    return chain(seed.named(), seed.relatives(), systematic(seed))
+
+
 def relatives(format_id: str) -> Iterator[Case]:
-    """Yield the hostile files of a format that are named one by one."""
+    """Yield the files of a format that are there for one rule or one field each."""
     for seed in seeds_of(format_id):
-        for what, data in seed.relatives():
-            yield Case(-1, seed, what, data)
+        for what, data in seed.named():
+            yield Case(-16, seed, what, data)  # judged thoroughly
+        for number, (what, data) in enumerate(seed.relatives()):
+            yield Case(-1 - number, seed, what, data)
 
 
 @cache
 def systematic_counts(format_id: str) -> tuple[tuple[Seed, int], ...]:
     """Return each seed and how many systematic cases it gives."""
-    return tuple((seed, sum(1 for _ in systematic(seed)) + sum(1 for _ in seed.relatives())) for seed in seeds_of(format_id))
+    return tuple((seed, sum(1 for _ in _unsealed(seed))) for seed in seeds_of(format_id))
 
 
 def num_systematic(format_id: str) -> int:

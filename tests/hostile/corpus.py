@@ -8,7 +8,8 @@ import struct
 import tempfile
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from gsplat_tools.formats import save
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.registry import FORMATS
 from tests.clouds import random_cloud
-from tests.hostile import archives, rebuilders
+from tests.hostile import archives, named, rebuilders
 from tests.hostile.mutations import json_fields
 from tests.hostile.seed import Seed, Span
 
@@ -28,17 +29,23 @@ from tests.hostile.seed import Seed, Span
 @cache
 def seeds_of(format_id: str) -> tuple[Seed, ...]:
     """Return the seeds of a format; one that is new here starts from what its writer makes."""
-    return tuple(_written(FORMATS[format_id])) + tuple(_BY_HAND.get(format_id, list)())
+    seeds = [*_written(FORMATS[format_id]), *_BY_HAND.get(format_id, list)()]
+    return tuple(
+        replace(seed, named=_NAMED[format_id, seed.name]) if (format_id, seed.name) in _NAMED else seed for seed in seeds
+    )
 
 
 def _written(record: Format) -> Iterator[Seed]:
     """Yield what the writer makes of small clouds."""
     if record.write is None:
         return
-    for name, options in (("degree 1", {"sh_degree": 1}), ("moving", {"sh_degree": 0, "motion": True})):
-        if name == "moving" and not record.holds_motion:
-            continue
-        data, beside = written_files(record, **options)
+    variants: list[tuple[str, dict[str, Any], dict[str, Any]]] = [("degree 1", {"sh_degree": 1}, {})]
+    if record.holds_motion:
+        variants.append(("moving", {"sh_degree": 0, "motion": True}, {}))
+    if "raw_color" in {field.name for field in fields(record.write_options)}:
+        variants.append(("raw colors", {"sh_degree": 0}, {"raw_color": True}))
+    for name, cloud, options in variants:
+        data, beside = written_files(record, cloud, **options)
         text_end = _text_end(data)
         spans = _SPANS.get(record.id, lambda data: (Span(0, min(len(data), 64)),))(data)
         if text_end:
@@ -55,24 +62,22 @@ def _written(record: Format) -> Iterator[Seed]:
                 beside=files,
                 target=next(iter(files)),
                 relatives=partial(json_fields, text),
+                named=partial(named.companions, text, data),
             )
+        if options and beside:
+            continue  # another file without what lies beside it
         rebuild = (archives.zip_rebuilder(data),) if data[:2] == b"PK" else ()
         yield Seed(
             f"written, {name}", f"scene{record.extensions[0]}", data, spans, _SEALS.get(record.id, _default_seal(data)), rebuild
         )
 
 
-def written(record: Format, **options: Any) -> bytes:
-    """Return the file of five random splats."""
-    return written_files(record, **options)[0]
-
-
-def written_files(record: Format, **options: Any) -> tuple[bytes, dict[str, bytes]]:
+def written_files(record: Format, cloud: dict[str, Any], **options: Any) -> tuple[bytes, dict[str, bytes]]:
     """Return the file of five random splats, and what lies beside it, without the checksum that ties the two together."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", GsplatWarning)
         path = Path(folder) / f"scene{record.extensions[0]}"
-        save(random_cloud(5, **options), path, to=record.id, order="none")
+        save(random_cloud(5, **cloud), path, to=record.id, order="none", **options)
         beside = {}
         for other in Path(folder).iterdir():
             if other != path:
@@ -321,11 +326,23 @@ def _sog() -> list[Seed]:
     meta = files.pop("meta.json")
     whole = tuple(archives.text_spans(meta, 0, len(meta)))
     rebuild = (rebuilders.text(meta),)
-    seeds.append(Seed("folder", "meta.json", meta, whole, rebuild=rebuild, beside=files, relatives=partial(json_fields, meta)))
+    seeds.append(
+        Seed(
+            "folder",
+            "meta.json",
+            meta,
+            whole,
+            rebuild=rebuild,
+            beside=files | named.FOLDER_FILES,
+            relatives=partial(json_fields, meta),
+            named=partial(named.folder, meta),
+        )
+    )
     beside = {f"a/{name}": data for name, data in _small(large(0)).items()} | {
         "b.sog": archive(_small(large(1))),
         "env.sog": archive(version_1(1)),
     }
+    beside |= named.lod_files()
     leaf = {"0": {"file": 0, "offset": 1, "count": 2}, "1": {"file": 1, "offset": 0, "count": 5}}
     tree = {
         "bound": {"min": [0, 0, 0], "max": [1, 1, 1]},
@@ -364,4 +381,15 @@ _BY_HAND: dict[str, Callable[[], list[Seed]]] = {
     "splat4d": _splat4d,
     "sog4d": _sog4d,
     "sog": _sog,
+}
+_NAMED: dict[tuple[str, str], Callable[[], Iterable[tuple[str, bytes]]]] = {
+    ("ply", "plain"): named.ply,
+    ("compressed-ply", "without colors, big-endian"): named.compressed_ply,
+    ("spark", "by hand"): partial(named.gspk, "spark"),
+    ("uncompressed", "by hand"): partial(named.gspk, "uncompressed"),
+    ("spz", "version 4"): named.spz,
+    ("splat4d", "plain"): named.splat4d,
+    ("sog4d", "version 1, deltas"): named.sog4d,
+    ("sog", "version 2"): named.sog,
+    ("sog", "levels"): named.lod,
 }

@@ -19,6 +19,7 @@ WRITERS = (
         "_files",
         "_folder",
         "_relaxing",
+        "_stores",
         "base",
         "knobs",
         "loading",
@@ -36,7 +37,8 @@ WRITERS = (
 """Modules that write, or that hold no parser; new ones count until they are named here."""
 
 NOT_READING = (
-    r"def (write|encode|quantize|choose|rotation_grid|bounds|compose|changes|repaired)\w*\(",
+    r"def (write|encode|quantize|choose|rotation_grid|bounds|compose|changes|repaired|meta_text)\w*\(",
+    r"def _(check_quats|check\(cloud|palette_fields|write\()",
     r"def _(fitting|check_options|calibrate|clamped|rounding|stored_error|bounds|extents|half_steps|level_of|outside)\b",
     r"def _(box_to_json|warn_clamped|color_bound|compose\w*)\(",
     r"def (spz_bounds|half_step|facts_of|coordinate_record|comment_lines|publish\w*|remove_\w*|sweep_\w*|describe|to_json)\(",

@@ -18,8 +18,10 @@ from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cli._output import finite
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, UnknownFormatError
 from gsplat_tools.formats import load
+from gsplat_tools.formats._limits import use_max_memory
 from gsplat_tools.formats.base import FileInfo, Format
 from gsplat_tools.formats.loading import located, open_as, open_scene
+from gsplat_tools.formats.sog4d import planes
 from gsplat_tools.inspection import describe
 from gsplat_tools.sequence import GaussianSequence
 from gsplat_tools.validation import rules_of, validate
@@ -29,6 +31,14 @@ SECONDS = 5.0
 
 BASE_BYTES = 64 << 20
 DECODED_FACTOR = 3
+
+_OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
+    "ply": ({"time_model": "gaussian"},),
+    "splat4d": ({"time_model": "gaussian"}, {"frame": 1}),
+    "sog": ({"lod": 1},),
+    "sog4d": ({"shn_order": "channel-major"},),
+}
+"""Choices that a reader leaves to its caller."""
 
 _STATUS = Path("/proc/self/status")
 _CLEAR = Path("/proc/self/clear_refs")
@@ -59,14 +69,19 @@ def judge(record: Format, path: Path, *, thorough: bool = False, seconds: float 
     info = _watched("inspect", lambda: _inspect(record, path), declared, flaws, limit)
     if isinstance(info, FileInfo):
         declared = declared_bytes(info)
-    outcome = _watched("read", lambda: _read(record, path, in_chunks=False), declared, flaws, limit)
+    outcome = _watched("read", lambda: _read(record, path, in_chunks=False, again=thorough), declared, flaws, limit)
     if record.read_chunks is not None:
-        _watched("chunks", lambda: _read(record, path, in_chunks=True), declared, flaws, limit)
+        _watched("chunks", lambda: _read(record, path, in_chunks=True, again=thorough), declared, flaws, limit)
     if record.check is not None:
         _watched("check", lambda: _check(record, path), declared, flaws, limit)
     if thorough:
         _watched("load", lambda: load(path), declared, flaws, limit)
         _watched("stream", lambda: _read_stream(record, path), declared, flaws, limit)
+        for options in _OPTIONS.get(record.id, ()):
+            _watched(f"read {options}", lambda options=options: _read_stream(record, path, **options), declared, flaws, limit)
+        _watched("little memory", lambda: _read_little(record, path), declared, flaws, limit)
+        if record.id == "sog4d":
+            _watched("planes", lambda: planes(path, 1), declared, flaws, limit)
         _watched("validate", lambda: json.dumps(finite(validate(path)), allow_nan=False), declared, flaws, limit)
         if record.repair is not None:
             _watched("repair", lambda: _repair(record, path), declared, flaws, limit)
@@ -176,21 +191,31 @@ def _inspect(record: Format, path: Path) -> FileInfo:
     return info
 
 
-def _read(record: Format, path: Path, *, in_chunks: bool) -> None:
+def _read(record: Format, path: Path, *, in_chunks: bool, again: bool = False) -> None:
     with open_scene(path, in_chunks=in_chunks, as_format=record.id) as scene:
         if isinstance(scene, CloudChunks):
-            count = sum(len(chunk) for chunk in scene)
-            assert count == scene.num_splats, f"{count} splats in chunks, {scene.num_splats} announced"
+            for _ in range(1 + again):
+                count = sum(len(chunk) for chunk in scene)
+                assert count == scene.num_splats, f"{count} splats in chunks, {scene.num_splats} announced"
         elif isinstance(scene, GaussianSequence):
-            for frame in range(min(len(scene), 3)):
+            frames = range(min(len(scene), 6 if again else 3))
+            for frame in (*frames, *([0] if again else [])):
                 scene.frame(frame)
 
 
-def _read_stream(record: Format, path: Path) -> None:
-    """Read from memory, where nothing lies beside the file."""
+def _read_stream(record: Format, path: Path, **options: Any) -> None:
+    """Read from memory, where nothing lies beside the file; or with options, from where it is."""
     assert record.read is not None
-    with located(path):
-        record.read(io.BytesIO(path.read_bytes()), record.read_options())
+    with located(path), open_as(path, record) if options else io.BytesIO(path.read_bytes()) as stream:
+        scene = record.read(stream, record.read_options(**options))
+        if isinstance(scene, GaussianSequence):
+            scene.frame(0)
+
+
+def _read_little(record: Format, path: Path) -> None:
+    """Read while hardly anything is allowed to be decoded."""
+    with use_max_memory(100):
+        _read(record, path, in_chunks=False)
 
 
 def _check(record: Format, path: Path) -> None:

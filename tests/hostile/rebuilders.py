@@ -95,23 +95,27 @@ def ply(rng: Random) -> bytes:
     return ply_file(*elements, encoding=encoding, comments=comments, newline=rng.choice((b"\n", b"\n", b"\r\n", b"\r")))
 
 
-def gspk_file(layout: str, *, count: int = 3, degree: int = 1, **changes: Any) -> bytes:
-    """Return a sound file of either layout."""
+def gspk_file(
+    layout: str,
+    *,
+    count: int = 3,
+    degree: int = 1,
+    facts: dict[str, Any] | None = None,
+    arrays: dict[str, Any] | None = None,
+    **changes: Any,
+) -> bytes:
+    """Return a sound file of either layout; `facts` and `arrays` come on top."""
     rng = np.random.default_rng(7)
-    description: dict[str, Any] = spark_description(count, degree, layout=layout)
+    description: dict[str, Any] = spark_description(count, degree, layout=layout) | (facts or {})
     bands = {1: 2, 2: 4, 3: 4, 4: 4}
     if layout == "spark":
-        arrays = {"packed": ("u32", rng.integers(0, 1 << 28, (count, 4)))}
-        arrays |= {f"sh{band}": ("u32", rng.integers(0, 1 << 28, (count, bands[band]))) for band in range(1, degree + 1)}
+        streams = {"packed": ("u32", rng.integers(0, 1 << 28, (count, 4)))}
+        streams |= {f"sh{band}": ("u32", rng.integers(0, 1 << 28, (count, bands[band]))) for band in range(1, degree + 1)}
     else:
-        arrays = {
-            "positions": ("f32", rng.random((count, 3))),
-            "colors": ("f32", rng.random((count, 4))),
-            "scales": ("f32", rng.random((count, 3))),
-            "rotations": ("f32", rng.random((count, 4))),
-            "shs": ("f32", rng.random((count, 3, 3))),
-        }
-    return assemble(description, arrays, **changes)
+        widths = {"positions": 3, "colors": 4, "scales": 3, "rotations": 4}
+        streams = {name: ("f32", rng.random((count, width))) for name, width in widths.items()}
+        streams |= {"shs": ("f32", rng.random((count, (degree + 1) ** 2 - 1, 3)))} if degree else {}
+    return assemble(description, streams | (arrays or {}), **changes)
 
 
 def gspk(layout: str) -> Callable[[Random], bytes]:

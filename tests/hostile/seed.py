@@ -33,7 +33,8 @@ class Seed:
     seal        makes checksums right again, or compresses, so that a change reaches the code behind them
     rebuild     each assembles a hostile relative of the file, field by field
     beside      files that lie in the same folder
-    relatives   hostile files that are named one by one, sealed
+    relatives   hostile files that follow from the fields of its description, sealed
+    named       hostile files, and a few sound ones, that are there for one rule each, sealed
     target      the file that is read, where it is not this one but refers to it
     """
 
@@ -46,3 +47,4 @@ class Seed:
     beside: Mapping[str, bytes] = field(default_factory=dict)
     target: str | None = None
     relatives: Callable[[], Iterable[tuple[str, bytes]]] = tuple
+    named: Callable[[], Iterable[tuple[str, bytes]]] = tuple
