@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c8c00", "#444444", "#b2182b")
-"""Told apart by color-blind readers where there are eight or fewer. Source: Okabe and Ito 2008, extended."""
+COLORS = (
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a63a8",
+    "#8c8c00", "#7f7f7f", "#b2182b", "#8c564b", "#00b3b3", "#e377ff", "#66a61e",
+)  # fmt: skip
+"""Seen on white and on black; color-blind readers tell the first six apart. Source: Okabe and Ito 2008, extended."""
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 56, 14, 14, 44
 _DECADES_WITH_HALVES = 2.5
@@ -48,7 +51,7 @@ def scatter(
     Parameters
     ----------
     series
-        Colors go round where there are more than ten.
+        Colors go round where there are more than there are colors.
     x_label, y_label
         With units.
     log_x, log_y

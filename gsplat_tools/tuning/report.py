@@ -26,14 +26,16 @@ INDISTINGUISHABLE = 80.0
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8882; }
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1400px; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+h1 { font-size: 1.5rem; overflow-wrap: anywhere; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
 .plots { display: flex; flex-wrap: wrap; gap: 1rem; } .plots svg { flex: 1 1 480px; max-width: 100%; }
 svg text { font: 12px system-ui, sans-serif; fill: currentColor; } svg .tick { opacity: .7; } svg .grid { stroke: var(--line); }
 .legend span { display: inline-block; margin-right: 1.1rem; } .legend i { display: inline-block; width: .8em; height: .8em;
  border-radius: 50%; margin-right: .35em; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
-th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th { cursor: pointer; position: sticky; top: 0; background: Canvas; }
+.scroll { overflow-x: auto; } table { font-size: 13px; border-collapse: collapse; width: 100%;
+ font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .5rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid; }
+@media (max-width: 700px) { body { margin: 1rem auto; padding: 0 .7rem; } }
 th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; }
 tr.pareto { background: var(--soft); font-weight: 600; } .note { opacity: .8; max-width: 60rem; }
 figure { margin: 1.2rem 0; } figure div { display: grid; grid-template-columns: repeat(3, 1fr); gap: 4px; }
@@ -42,8 +44,11 @@ figure img { width: 100%; display: block; } figcaption { margin-bottom: .3rem; }
 
 # Sorts by the clicked column; numbers by value (kept in data-v), words by letters.
 _SCRIPT = """
-document.querySelectorAll('th').forEach((head, column) => head.addEventListener('click', () => {
+const heads = document.querySelectorAll('th');
+heads.forEach((head, column) => head.firstChild.addEventListener('click', () => {
   const body = head.closest('table').tBodies[0], down = head.dataset.down = head.dataset.down === '1' ? '0' : '1';
+  heads.forEach(each => each.removeAttribute('aria-sort'));
+  head.setAttribute('aria-sort', down === '1' ? 'ascending' : 'descending');
   const key = row => { const v = row.cells[column].dataset.v; return v === undefined ? row.cells[column].textContent : +v; };
   [...body.rows].sort((a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : 0) * (down === '1' ? 1 : -1))
     .forEach(row => body.append(row));
@@ -168,7 +173,7 @@ def _words(row: dict[str, Any]) -> str:
 
 def _table(rows: list[dict[str, Any]]) -> str:
     """Return every point as a row."""
-    head = "".join(f"<th>{name}</th>" for name, _, _ in _COLUMNS)
+    head = "".join(f'<th scope="col"><button>{name}</button></th>' for name, _, _ in _COLUMNS)
     lines = []
     for row in rows:
         cells = [f"<td>{escape(row['format'])}</td><td>{escape(_words(row))}</td>"]
@@ -192,7 +197,8 @@ def _pictures(tradeoff: Tradeoff) -> str:
         if not mark or pair is None or point.likeness is None or point.likeness.psnr_min is None:
             continue
         images = (to_uint8(pair[0]), to_uint8(pair[1]), difference_picture(*pair, gain=DIFFERENCE_GAIN))
-        shown = "".join(f'<img src="{_embedded(image)}" alt="">' for image in images)
+        names = ("source", "candidate", "difference")
+        shown = "".join(f'<img src="{_embedded(image)}" alt="{name}">' for name, image in zip(names, images, strict=True))
         caption = f"{point.setting.label}: {point.bytes:,} bytes, {point.likeness.psnr_min:.2f} dB"
         figures.append(f"<figure><figcaption>{escape(caption)}</figcaption><div>{shown}</div></figure>")
     return "".join(figures)

@@ -23,6 +23,7 @@ from gsplat_tools.tuning.measuring import Model, Picture, Point, Setting, Workbe
 PRESETS = ("fast", "balanced", "best")
 _WARM_UP_SPLATS = 256
 """Enough to compile every kernel of a format."""
+_VALUES_OF_A_KNOB = 6
 
 
 @dataclass(slots=True)
@@ -158,7 +159,8 @@ def measure_tradeoff(
     records = [FORMATS[name] for name in formats or FORMATS]
     if not formats:
         records = [each for each in records if each.write and each.read and (not is_sequence or each.holds_sequences)]
-    wanted = [setting for record in records for setting in settings_of(record, scene.sh_degree, knobs=knobs)] + [*settings]
+    wanted = [setting for record in records for setting in settings_of(record, scene.sh_degree, knobs=knobs, moves=is_sequence)]
+    wanted += settings
     bench = Workbench(scene, views=views, size=size, model=model)
     small = Workbench(scene if isinstance(scene, GaussianSequence) else scene.take(slice(0, _WARM_UP_SPLATS)), views=1)
     result = Tradeoff(
@@ -205,7 +207,13 @@ def pareto_front(points: Sequence[tuple[int, float]]) -> list[bool]:
     return [not any((b <= size and q >= level) and (b < size or q > level) for b, q in points) for size, level in points]
 
 
-def settings_of(record: Format, sh_degree: int, *, knobs: bool = False) -> list[Setting]:
+def _spread(values: Sequence[Any]) -> list[Any]:
+    """Return a few values of a knob, its ends among them."""
+    places = np.linspace(0, len(values) - 1, min(len(values), _VALUES_OF_A_KNOB))
+    return [values[round(place)] for place in places]
+
+
+def settings_of(record: Format, sh_degree: int, *, knobs: bool = False, moves: bool = True) -> list[Setting]:
     """Return the settings of a format that differ: its presets, fewer SH bands, and its knobs one at a time.
 
     Parameters
@@ -215,7 +223,9 @@ def settings_of(record: Format, sh_degree: int, *, knobs: bool = False) -> list[
     sh_degree
         Highest band of the scene.
     knobs
-        Whether to turn every knob by itself.
+        Whether to turn every knob by itself, those with many values to six of them from end to end.
+    moves
+        Whether the scene is a sequence: some knobs say nothing about a still scene.
     """
     wanted = [Setting(format=record.id, preset=preset) for preset in PRESETS if preset in (record.presets or {DEFAULT_PRESET})]
     if not record.lossless:
@@ -224,7 +234,12 @@ def settings_of(record: Format, sh_degree: int, *, knobs: bool = False) -> list[
             for degree in reversed(range(min(sh_degree, record.max_sh_degree)))
         ]
     if knobs:
-        wanted += [Setting(format=record.id, options={name: v}) for name, values in record.knobs.items() for v in values]
+        wanted += [
+            Setting(format=record.id, options={name: value})
+            for name, knob in record.knobs.items()
+            if moves or not knob.sequences_only
+            for value in _spread(knob.values)
+        ]
     chosen: dict[tuple[Any, ...], Setting] = {}
     for setting in wanted:
         chosen.setdefault(split_options(record, setting.preset, dict(setting.options)), setting)

@@ -39,6 +39,17 @@ def test_settings__of_a_format_all_differ_and_hold(record) -> None:
     assert all(chosen.count(each) == 1 for each in chosen)
 
 
+def test_settings__turn_a_long_knob_to_a_few_values_with_its_ends() -> None:
+    record = FORMATS["sog4d"]
+    options = [setting.options for setting in settings_of(record, 3, knobs=True, moves=False)]
+
+    pruned = [each["prune_opacity"] for each in options if "prune_opacity" in each]
+    values = record.knobs["prune_opacity"].values
+    assert len(pruned) <= 6
+    assert values[0] in pruned
+    assert not any(name in each for each in options for name, knob in record.knobs.items() if knob.sequences_only)
+
+
 def test_tradeoff__of_a_crop_says_what_it_is_part_of() -> None:
     cloud = random_cloud(600, sh_degree=0)
 
