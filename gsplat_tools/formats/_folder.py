@@ -113,8 +113,12 @@ def _placing(path: Path, placed: list[Path]) -> Iterator[BinaryIO]:
 
 
 def folder_size(path: Path, layout: FolderLayout) -> int:
-    """Return the bytes of an index and the files that it names."""
-    return sum(file.stat().st_size for file in {path, *_files_of(path, layout)})
+    """Return the bytes of an index and the files that it names, as far as no other writer is just replacing them."""
+    size = 0
+    for file in {path, *_files_of(path, layout)}:
+        with suppress(FileNotFoundError):
+            size += file.stat().st_size
+    return size
 
 
 def _files_of(path: Path, layout: FolderLayout) -> set[Path]:

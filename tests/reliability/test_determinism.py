@@ -9,7 +9,8 @@ import pytest
 from tests.reliability.cases import Case, cases
 from tests.reliability.determinism import JOBS, differences, digests, in_fresh_process
 
-SPLATS = 500
+SPLATS = 17_000
+"""Two blocks of work, so that threads have something to share."""
 RUNS = 3
 
 

@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from gsplat_tools.errors import WriteError
-from gsplat_tools.formats import _files
+from gsplat_tools.formats import _files, _folder, saving
+from gsplat_tools.formats.base import FolderLayout
 from tests.reliability.cases import Case, cases
 from tests.reliability.crash import (
     ACTS,
@@ -31,17 +32,20 @@ from tests.reliability.crash import (
 )
 from tests.reliability.faults import EXIT_REFUSED, Operations, failing, in_child, leftovers, operations_of
 
+KINDS = [case for case in cases() if case.id in {"ply", "spark", "sog4d-sequence", "sog-folder", "visionary-f16"}]
+"""A plain file, packs, archives, folders, files with companions."""
+
 every_writer = pytest.mark.parametrize("case", cases(), ids=lambda case: case.id)
-one_of_each_kind = pytest.mark.parametrize(
-    "case",
-    [case for case in cases() if case.id in {"ply", "spark", "sog4d-sequence", "sog-folder", "visionary-f16"}],
-    ids=lambda c: c.id,
-)
+one_of_each_kind = pytest.mark.parametrize("case", KINDS, ids=lambda case: case.id)
 old_or_absent = pytest.mark.parametrize("exists", [True, False], ids=["old", "absent"])
+every_writer_over_an_old_target = pytest.mark.parametrize(
+    ("case", "exists"),
+    [pytest.param(case, True, id=f"{case.id}-old") for case in cases()]
+    + [pytest.param(case, False, id=f"{case.id}-absent") for case in KINDS],
+)
 
 
-@every_writer
-@old_or_absent
+@every_writer_over_an_old_target
 def test_kill__at_operations_leaves_the_old_or_the_new_target(case: Case, exists: bool) -> None:
     acts = {name: ACTS[name] for name in ("before", "halfway")}  # after one is before the next
 
@@ -72,8 +76,7 @@ def test_kill__at_random_leaves_the_old_or_the_new_target(case: Case) -> None:
     assert kill_at_random(case, exists=True, times=2, splats=300)
 
 
-@every_writer
-@old_or_absent
+@every_writer_over_an_old_target
 def test_faults__at_any_operation_are_errors_or_do_no_harm(case: Case, exists: bool) -> None:
     outcomes = fail_at_operations(case, exists=exists, most=2)
 
@@ -94,8 +97,6 @@ def test_short_writes__are_continued(case: Case) -> None:
 
 @every_writer
 def test_header__that_contradicts_the_scene_keeps_the_target_as_it_was(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsplat_tools.formats import saving
-
     count = saving.count_splats
     with targets(case, 12, exists=True) as fresh:
         target = fresh()
@@ -247,6 +248,25 @@ def test_two_writers__of_one_target_both_end_well(case: Case, tmp_path: Path) ->
     assert in_child(both) == 0
     assert case.content(tmp_path / case.name) in allowed
     assert leftovers(tmp_path) == []
+
+
+def test_two_writers__of_one_folder_count_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = next(case for case in cases() if case.id == "sog-folder")
+    named, folder_size = _folder._files_of, saving.folder_size
+
+    def named_then_replaced(path: Path, layout: FolderLayout) -> set[Path]:
+        found = named(path, layout)
+        monkeypatch.undo()
+        case.write(path, seed=NEW)
+        return found
+
+    def while_another_writes(path: Path, layout: FolderLayout) -> int:
+        monkeypatch.setattr(_folder, "_files_of", named_then_replaced)
+        return folder_size(path, layout)
+
+    monkeypatch.setattr(saving, "folder_size", while_another_writes)
+
+    case.write(tmp_path / case.name)
 
 
 def test_two_writers__without_leave_to_overwrite_make_one_target(tmp_path: Path) -> None:
