@@ -15,8 +15,8 @@ from gsplat_tools.cluster.parts import read_part
 from gsplat_tools.cluster.sequences import convert_sequence
 from gsplat_tools.errors import CapabilityError, CloudError, TargetExistsError, WriteError
 from gsplat_tools.formats.saving import save
-from tests.cluster.sequences import killing, local_bundle, make_frames, parts_of, pids, sha256
 from tests.clouds import random_cloud
+from tests.cluster.sequences import killing, local_bundle, make_frames, parts_of, pids, sha256
 from tests.formats.test_sog4d_sequences import moving
 
 pytestmark = pytest.mark.cluster

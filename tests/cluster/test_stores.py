@@ -17,10 +17,10 @@ from gsplat_tools.formats import _stores, load
 from gsplat_tools.formats._stores import is_url, local_path, replacing_object, url_of
 from gsplat_tools.formats.loading import inspect_file
 from gsplat_tools.formats.saving import save
+from tests.clouds import random_cloud
 from tests.cluster.sequences import local_bundle, make_frames, sha256
 from tests.cluster.stores import BUCKET, Proxy, s3_server
 from tests.cluster.test_sequences import SHORT
-from tests.clouds import random_cloud
 
 fsspec = pytest.importorskip("fsspec")
 pytestmark = pytest.mark.cluster
@@ -86,7 +86,7 @@ def test_objects__are_sources_and_targets(memory: Any, tmp_path: Path) -> None:
     assert report["target"]["path"] == "memory://b/a.spz"
     assert memory.cat("/b/a.spz") == (tmp_path / "a.spz").read_bytes()
     assert np.array_equal(load("memory://b/a.ply").means, cloud.means)  # type: ignore[union-attr]
-    with pytest.raises(TargetExistsError, match="memory://b/a.spz"):
+    with pytest.raises(TargetExistsError, match=r"memory://b/a\.spz"):
         convert(["memory://b/a.ply"], "memory://b/a.spz")
     with pytest.raises(FileNotFoundError):
         load("memory://b/none.ply")
@@ -184,5 +184,5 @@ def test_a_store_that_stays_busy__is_an_error_that_names_it(store: Proxy, monkey
     save(random_cloud(20), "s3://bucket/a.ply")
     store.fault = lambda _method, _path, _number: "503"
 
-    with pytest.raises(ReadError, match="s3://bucket/a.ply: cannot read from the store"):
+    with pytest.raises(ReadError, match=r"s3://bucket/a\.ply: cannot read from the store"):
         load("s3://bucket/a.ply")
