@@ -122,20 +122,20 @@ def test_auto__holds_choices_that_are_no_knobs_against_what_else_there_is(scene:
         times=np.zeros(count, np.float32),
         durations=np.ones(count, np.float32),
     )
-    tuned = tune(still, find_format("compressed-ply"), preset="balanced", options={}, size=(64, 36))
+    tuned = tune(still, find_format("compressed-ply"), preset="balanced", options={}, **SMALL)
     decisions = {each["option"]: each for each in tuned.decisions}
 
     assert decisions["outliers"]["value"] == "drop" == tuned.options["outliers"]
     assert decisions["outliers"]["bytes_saved"] > 0 >= decisions["outliers"]["db_lost"] - 0.01
-    kept = tune(still, find_format("compressed-ply"), preset="balanced", options={"outliers": "keep"}, size=(64, 36))
+    kept = tune(still, find_format("compressed-ply"), preset="balanced", options={"outliers": "keep"}, **SMALL)
     assert "outliers" not in {each["option"] for each in kept.decisions}
 
-    moving = tune(still, find_format("ply"), preset="balanced", options={}, size=(64, 36))
+    moving = tune(still, find_format("ply"), preset="balanced", options={}, **SMALL)
     assert next(each for each in moving.decisions if each["option"] == "motion")["bytes_saved"] >= count * 5 * 4
 
 
 def test_preset__is_taken_a_step_coarser_where_the_search_finds_nothing_smaller(scene: GaussianCloud, monkeypatch) -> None:
-    searcher = Searcher(scene, find_format("spz"), size=(64, 36))
+    searcher = Searcher(scene, find_format("spz"), **SMALL)
     reached = searcher.whole.encode({})
     monkeypatch.setattr("gsplat_tools.tuning.search._Hunt.run", _fail)
     found = searcher.find(Budget(min_psnr=reached.level - 0.5))
