@@ -153,7 +153,7 @@ def convert_sequence(
         job = _Job(source, choices, write_options, stages, _checks(record.model, len(files), validation))
         kept, fit, shared = job.fit()
         looked = time.perf_counter()
-        folder = parts or _beside(target)
+        folder = _folder_of_parts(target, parts)
         found = job.encode(fit, shared, folder)
         encoded = time.perf_counter()
         busy = [sum(part.seconds.get(name, 0) for part in found) for name in ("validate", "read", "encode", "write")]
@@ -421,13 +421,14 @@ def _no_frame(_frame_id: int) -> Any:
     raise AssertionError("a header needs no frame")
 
 
-def _beside(target: Path) -> str:
-    """Return the folder of parts of a target."""
-    if is_url(target):
-        folder, _, name = url_of(target).rpartition("/")
-        return f"{folder}/.{name}{PARTS_SUFFIX}"
-    whole = target.absolute()
-    return str(whole.with_name(f".{whole.name}{PARTS_SUFFIX}"))
+def _folder_of_parts(target: Path, parts: str | None) -> str:
+    """Return a folder that holds the parts of this target and nothing else."""
+    whole = url_of(target) if is_url(target) else str(target.absolute())
+    place, _, name = whole.replace("\\", "/").rpartition("/")
+    if parts is None:
+        return f"{place}/.{name}{PARTS_SUFFIX}"
+    own = f"{name}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}{PARTS_SUFFIX}"
+    return f"{url_of(parts).rstrip('/') if is_url(parts) else Path(local_path(parts)).absolute()}/{own}"
 
 
 def _remove_parts(folder: str) -> None:
@@ -436,8 +437,9 @@ def _remove_parts(folder: str) -> None:
         if is_url(folder):
             remove(folder)
             return
-        for path in Path(folder).glob("*.part"):
-            path.unlink()
+        for path in Path(folder).iterdir():
+            if path.suffix in (".part", ".gsplat-tmp"):
+                path.unlink(missing_ok=True)
         with suppress(OSError):
             Path(folder).rmdir()
     except (OSError, WriteError) as error:
