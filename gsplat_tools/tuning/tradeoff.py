@@ -179,6 +179,7 @@ def measure_tradeoff(
                     warm.add(setting.format)
                 point = bench.measure(setting, repeats=repeats, see=_keep_in(seen))
             except GsplatError as error:
+                error.path = None  # a temporary file, of which the name says nothing
                 result.skipped.append((setting, str(error)))
             else:
                 result.points.append(point)

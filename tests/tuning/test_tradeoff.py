@@ -15,6 +15,7 @@ from gsplat_tools.formats import save
 from gsplat_tools.formats.registry import FORMATS
 from gsplat_tools.formats.saving import split_options
 from gsplat_tools.ops.sampling import crop
+from gsplat_tools.tuning.measuring import Setting
 from gsplat_tools.tuning.tradeoff import measure_tradeoff, pareto_front, settings_of
 from tests.clouds import random_cloud
 
@@ -48,6 +49,17 @@ def test_settings__turn_a_long_knob_to_a_few_values_with_its_ends() -> None:
     assert len(pruned) <= 6
     assert values[0] in pruned
     assert not any(name in each for each in options for name, knob in record.knobs.items() if knob.sequences_only)
+
+
+def test_tradeoff__says_what_is_not_possible_without_the_name_of_a_temporary_file() -> None:
+    cloud = random_cloud(100, sh_degree=0)
+    far = cloud.replace(means=cloud.means + np.float32(40))
+
+    found = measure_tradeoff(far, formats=["spz"], settings=[Setting(format="spz", options={"fractional_bits": 22})], **SMALL)
+
+    (setting, reason), *others = found.skipped
+    assert (dict(setting.options), others) == ({"fractional_bits": 22}, [])
+    assert reason.startswith("means: 100 of 100 splats")
 
 
 def test_tradeoff__of_a_crop_says_what_it_is_part_of() -> None:
