@@ -12,7 +12,7 @@ RUN = 64
 """Splats of a run: long enough that neighbours predict each other as in the whole scene."""
 
 
-def crop(cloud: GaussianCloud, count: int) -> GaussianCloud:
+def crop(cloud: GaussianCloud, count: int, *, keeps_box: bool = False) -> GaussianCloud:
     """Return the splats nearest to the middle of the scene, in their order.
 
     Parameters
@@ -21,6 +21,8 @@ def crop(cloud: GaussianCloud, count: int) -> GaussianCloud:
         Valid splats.
     count
         Splats to keep; all where there are no more.
+    keeps_box
+        Keep the outermost splats too, up to six, so that positions have the range of the whole.
 
     Returns
     -------
@@ -30,7 +32,10 @@ def crop(cloud: GaussianCloud, count: int) -> GaussianCloud:
     if count >= len(cloud):
         return cloud
     distances = np.square(cloud.means - np.median(cloud.means, axis=0)).sum(axis=1)
-    return cloud.take(np.sort(np.argpartition(distances, count - 1)[:count]))
+    chosen = np.argpartition(distances, count - 1)[:count]
+    if keeps_box:
+        chosen = np.concatenate([chosen, cloud.means.argmin(axis=0), cloud.means.argmax(axis=0)])
+    return cloud.take(np.unique(chosen))
 
 
 def spread_runs(cloud: GaussianCloud, count: int) -> NDArray[np.intp]:

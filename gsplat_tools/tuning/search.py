@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import GsplatError, ValidationError
+from gsplat_tools.errors import CapabilityError, GsplatError, ValidationError
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.knobs import Knob
 from gsplat_tools.formats.saving import DEFAULT_PRESET
@@ -340,8 +341,13 @@ class _Hunt:
         )
 
     def _verify(self, choice: Choice) -> Trial:
-        """Encode and draw the whole scene, and learn from it."""
-        trial = self._whole.encode(self._rates.options_of(choice))
+        """Encode and draw the whole scene, and learn from it; what the format cannot hold is worth nothing."""
+        try:
+            trial = self._whole.encode(self._rates.options_of(choice))
+        except CapabilityError:  # the part that was searched has less in it
+            trial = Trial(sys.maxsize, 0, np.ones_like(choice.errors))
+            self._verified[choice.places] = choice, trial
+            return trial
         self._verified[choice.places] = choice, trial
         self._correct(choice, trial)
         return trial
@@ -449,7 +455,7 @@ def _part(scene: GaussianCloud | GaussianSequence) -> GaussianCloud | GaussianSe
     from gsplat_tools.ops.sampling import crop
 
     if isinstance(scene, GaussianCloud):
-        return crop(scene, SEARCH_SPLATS) if len(scene) > 1.25 * SEARCH_SPLATS else scene
+        return crop(scene, SEARCH_SPLATS, keeps_box=True) if len(scene) > 1.25 * SEARCH_SPLATS else scene
     frames = [scene.frame(frame_id) for frame_id in range(min(SEARCH_FRAMES, len(scene)))]
     return GaussianSequence(frames.__getitem__, num_splats=scene.num_splats, sh_degree=scene.sh_degree, num_frames=len(frames))
 
