@@ -254,6 +254,19 @@ def test_keys__work_after_the_mouse_and_leave_lists_and_buttons_alone(new_view: 
         assert view.page.evaluate("viewer.stage.split") == 0
 
 
+def test_play__at_the_end_starts_again(new_view: NewView, bundle: Path) -> None:
+    view = new_view()
+
+    with serving(bundle) as server:
+        view.open(server.address)
+        view.page.uncheck("#loop")
+        view.page.evaluate("viewer.seek(1)")
+        view.page.click("#play")
+        view.page.click("#play")
+
+        assert view.page.evaluate("viewer.state.t") < 1
+
+
 def test_still_page__is_not_drawn_again(new_view: NewView) -> None:
     view = new_view(96, 64)
 

@@ -58,7 +58,8 @@ function size(bytes) {
 
 /** Tell what is wrong with a file, in the validator's words where the server has them. */
 async function explain(file, error) {
-  let words = `${file.name}: ${error?.message ?? error}`;
+  const reason = String(error?.message ?? error);
+  let words = reason.includes(file.name) ? reason : `${file.name}: ${reason}`;
   if (file.report) {
     const found = await fetch(file.report)
       .then((response) => response.json())
@@ -235,6 +236,7 @@ function resize() {
 
 function setPlaying(playing) {
   state.playing = playing && longest() !== null;
+  if (state.playing && state.t >= 1) seek(0);
   element("play").setAttribute("aria-pressed", String(state.playing));
   element("play").setAttribute("aria-label", state.playing ? "pause" : "play");
 }
