@@ -174,6 +174,30 @@ def test_words_that_do_not_go_together__are_usage_errors(scenes: Path, words: li
     assert CliRunner().invoke(main, words).exit_code == 2
 
 
+def test_other_schedulers__give_the_same_files(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+
+    def in_process(scheduler: str, jobs: int | None, retries: int) -> InProcess:
+        opened.append((scheduler, jobs, retries))
+        return InProcess(jobs, retries)
+
+    monkeypatch.setattr("gsplat_tools.cluster.engines.open_engine", in_process)
+    for index in range(3):
+        save(random_cloud(30, sh_degree=1, seed=index), scenes / f"f{index}.ply")
+    elsewhere = ["--scheduler", "local:3", "--jobs", "1", "--retries", "5", "--parts", "kept", "--json"]
+    for source, target in (("s0.ply", "{}.spz"), ("f?.ply", "{}.sog4d")):
+        result = CliRunner().invoke(main, [source, target.format("there"), *elsewhere])
+        CliRunner().invoke(main, [source, target.format("here")])
+        assert result.exit_code == 0
+        assert json.loads(result.stdout)["cluster"]["scheduler"] == "local"
+        assert Path(target.format("there")).read_bytes() == Path(target.format("here")).read_bytes()
+    assert opened == [("local:3", 1, 5)] * 2
+    assert not list(Path("kept").iterdir())
+    refused = CliRunner().invoke(main, ["f?.ply", "x.sog4d", "--time", "0.5", "--scheduler", "local:3"])
+    assert refused.exit_code == 1
+    assert refused.stderr == ("error: time cannot be asked for on a cluster; find options on one machine, then give them\n")
+
+
 def test_an_error_that_passes__is_tried_again_and_no_more_often(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 

@@ -166,11 +166,16 @@ def kill(scheduler_target: str) -> Callable[[Any], Any]:
 
 def on_files(cases: Cases, folder: Path) -> None:
     """Workers, kills, and a command that is killed itself; frames on the disk."""
+    on_commands(cases, folder)
     for scheduler in ("local", "local:2", "local-cluster:1", "local-cluster:2"):
         cases.case(f"files, {scheduler}", scheduler, cases.pattern, str(folder / f"{scheduler.replace(':', '')}.sog4d"))
     for scheduler in ("local:2", "local-cluster:1", "local-cluster:2"):
         target = str(folder / f"k{scheduler.replace(':', '')}.sog4d")
         cases.case(f"files, {scheduler}, a worker killed", scheduler, cases.pattern, target, kill(target))
+
+
+def on_commands(cases: Cases, folder: Path) -> None:
+    """The command is killed with its workers, again and again."""
     target = str(folder / "client.sog4d")
     command = [sys.executable, "-c", "from gsplat_tools.cli.convert import main; main()", cases.pattern, target]
     command += ["--scheduler", "local:2", "--no-validate", "--delta-segment-length", "8", "--jobs", "1"]
@@ -181,7 +186,8 @@ def on_files(cases: Cases, folder: Path) -> None:
             time.sleep(0.01)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        if process.wait() != -signal.SIGKILL:
+            raise Broken(f"the command ended by itself with status {process.returncode}")
         kills += 1
         if Path(target).exists():
             raise Broken("the command was killed, and something stands at the target")
