@@ -93,13 +93,16 @@ def tune(
         whole, decisions = without_what_never_changes(whole)
     valid = whole if isinstance(whole, GaussianSequence) else drop_or_refuse(whole, strict=bool(options.get("strict")))
     valid = name_axes(valid, options.get("source_coordinates"))
-    searcher = Searcher(valid, record, preset=preset, pinned=options, views=views, size=size, model=model)
+    keeps_splats = budget is not None and budget.max_bytes_per_splat is not None
+    searcher = Searcher(
+        valid, record, preset=preset, pinned=options, views=views, size=size, model=model, keep_splats=keeps_splats
+    )
     tuned = Tuned(scene=whole, decisions=decisions, bench=searcher.whole.bench)
     if not searcher.whole.bench.shows_anything(searcher.whole.bench.model_of(record)):
         raise ValidationError("the views show nothing of the scene, so that no choice can be judged by them")
     if budget is not None:
         tuned.found = searcher.find(budget)
-        tuned.options = dict(tuned.found.options)
+        tuned.options = {**({"outliers": "keep"} if keeps_splats else {}), **options, **tuned.found.options}
         tuned.decisions += [_of_search(each) for each in tuned.found.decisions]
         return tuned
     usual = searcher.whole.encode({})

@@ -159,7 +159,11 @@ def search(
     whole, drawn, and the prediction corrected, view by view, by what came out, until it holds. Pictures are half as wide
     and high while searching.
     """
-    return Searcher(scene, record, preset=preset, pinned=pinned, views=views, size=size, model=model).find(budget)
+    keeps_splats = budget.max_bytes_per_splat is not None
+    searcher = Searcher(
+        scene, record, preset=preset, pinned=pinned, views=views, size=size, model=model, keep_splats=keeps_splats
+    )
+    return searcher.find(budget)
 
 
 class Searcher:
@@ -181,7 +185,7 @@ class Searcher:
         keep_splats: bool = False,
     ) -> None:
         self._scene, self._keeps_splats = scene, keep_splats
-        pinned = dict(pinned or {})
+        pinned = {**({"outliers": "keep"} if keep_splats else {}), **(pinned or {})}
         self.whole = Trials(Workbench(scene, views=views, size=size, model=model), record, preset, pinned)
         half = max(size[0] // 2, 1), max(size[1] // 2, 1)
         self._part = Trials(Workbench(_part(scene), views=views, size=half, model=model), record, preset, pinned)
