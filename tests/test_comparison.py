@@ -3,8 +3,9 @@ import pytest
 
 from gsplat_tools.attributes import quaternions
 from gsplat_tools.chunks import as_chunks
-from gsplat_tools.comparison import AttributeTally, attribute_errors, match_splats, paired, sample
+from gsplat_tools.comparison import AttributeTally, attribute_errors, compare, match_splats, paired, sample
 from gsplat_tools.errors import CloudError
+from gsplat_tools.ops.coordinates import convert_coordinates
 from tests.clouds import random_cloud
 
 
@@ -118,3 +119,12 @@ def test_sample__takes_every_kth_splat_across_chunks() -> None:
     thinned = sample(as_chunks(cloud, 64), 250)
 
     assert np.array_equal(thinned.means, cloud.means[::4])
+
+
+def test_compare__brings_the_candidate_into_the_axes_of_the_reference() -> None:
+    reference = random_cloud(200, sh_degree=2).replace(coordinate_system="RDF")
+
+    report = compare(reference, convert_coordinates(reference, "RUF"), views=2, size=(96, 64))
+
+    assert report.psnr_min is None or report.psnr_min > 90
+    assert report.attributes["means"]["max"] == 0

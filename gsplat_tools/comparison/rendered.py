@@ -201,7 +201,8 @@ def compare(
     ----------
     reference, candidate
         Scenes; attributes are compared where both have the same splats (matched by position if their order differs).
-        Two sequences of the same length are compared frame by frame.
+        Two sequences of the same length are compared frame by frame. Where both say what their axes are, the candidate is
+        brought into those of the reference.
     views
         Number of automatic views of the reference, of each frame.
     size
@@ -228,7 +229,8 @@ def compare(
     def pairs() -> Iterator[tuple[str, GaussianCloud, GaussianCloud]]:
         matched: slice | NDArray[np.intp] | None = None
         for frame_id in range(count):
-            first, second = (still(scene, t, frame_id) for scene in (reference, candidate))
+            first, second = still(reference, t, frame_id), still(candidate, t, frame_id)
+            second = _in_axes_of(first, second)
             if frame_id == 0:
                 matched = match_splats(first, second)
             if matched is not None:
@@ -239,6 +241,16 @@ def compare(
     chosen = list(cameras) if cameras is not None else auto_cameras(still(reference, t), views=views, size=size)
     report = compare_rendered(pairs(), chosen, (model or "inria", variant), num_pairs=count, t=t, see=see)
     return replace(report, attributes=tally.to_json())
+
+
+def _in_axes_of(reference: GaussianCloud, candidate: GaussianCloud) -> GaussianCloud:
+    """Return the candidate in the axes of the reference, where both say what theirs are."""
+    from gsplat_tools.ops.coordinates import convert_coordinates
+
+    systems = {reference.coordinate_system, candidate.coordinate_system}
+    if "unknown" in systems or len(systems) == 1:
+        return candidate
+    return convert_coordinates(candidate, reference.coordinate_system)
 
 
 def common_frames(reference: GaussianCloud | GaussianSequence, candidate: GaussianCloud | GaussianSequence) -> int:
