@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -273,8 +274,13 @@ class Dask:
 
     def close(self) -> None:
         """Leave a running cluster, or end our own."""
+        # A client that lost its scheduler says so at length when it stops looking for it.
+        logger = logging.getLogger("distributed.client")
+        level = logger.level
+        logger.setLevel(logging.CRITICAL)
         with suppress(Exception):
             self._client.close(timeout=5)
+        logger.setLevel(level)
         if self._cluster is not None:
             with suppress(Exception):
                 self._cluster.close(timeout=10)
