@@ -63,11 +63,17 @@ def _unsealed(seed: Seed) -> Iterator[tuple[str, bytes]]:
     return chain(seed.named(), seed.relatives(), systematic(seed))
 
 
-def relatives(format_id: str) -> Iterator[Case]:
-    """Yield the files of a format that are there for one rule or one field each."""
+def named(format_id: str) -> Iterator[Case]:
+    """Yield the files of a format that are there for one rule each."""
     for seed in seeds_of(format_id):
         for what, data in seed.named():
             yield Case(-16, seed, what, data)  # judged thoroughly
+
+
+def relatives(format_id: str) -> Iterator[Case]:
+    """Yield the files of a format that are there for one rule or one field each."""
+    yield from named(format_id)
+    for seed in seeds_of(format_id):
         for number, (what, data) in enumerate(seed.relatives()):
             yield Case(-1 - number, seed, what, data)
 

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 import pytest
 
 from gsplat_tools.formats.registry import FORMATS
-from tests.hostile.cases import Case, sample
+from tests.hostile.cases import Case, named, sample
 from tests.hostile.corpus import seeds_of
 from tests.hostile.judge import BASE_BYTES, judge
 from tests.hostile.worker import judge_case, warm_up
@@ -34,6 +34,23 @@ def test_hostile_file__is_read_or_refused_and_nothing_else(format_id: str, tmp_p
     assert found == []
     assert outcomes["read"] > 0
     assert outcomes.total() - outcomes["read"] > CASES // 4
+
+
+@pytest.mark.parametrize("format_id", [format_id for format_id in READABLE if next(named(format_id), None)])
+def test_file_for_one_rule__is_read_or_refused_and_nothing_else(format_id: str, tmp_path: Path) -> None:
+    place = Workplace(tmp_path)
+    warm_up(format_id, place)
+
+    outcomes: Counter[str] = Counter()
+    found = []
+    for case in named(format_id):
+        outcome, flaws = judge_case(format_id, case, place)
+        outcomes[outcome] += 1
+        found += [f"{case.what} of {case.seed.name}, {flaw}" for flaw in flaws]
+
+    assert found == []
+    assert outcomes["read"] > 0
+    assert outcomes.total() > outcomes["read"]
 
 
 def _judged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, read: object) -> list[str]:
