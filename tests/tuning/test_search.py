@@ -137,7 +137,7 @@ def test_auto__holds_choices_that_are_no_knobs_against_what_else_there_is(scene:
 def test_preset__is_taken_a_step_coarser_where_the_search_finds_nothing_smaller(scene: GaussianCloud, monkeypatch) -> None:
     searcher = Searcher(scene, find_format("spz"), **SMALL)
     reached = searcher.whole.encode({})
-    monkeypatch.setattr("gsplat_tools.tuning.search._Hunt.run", _fail)
+    monkeypatch.setattr("gsplat_tools.tuning.hunting.Hunt.run", _fail)
     found = searcher.find(Budget(min_psnr=reached.level - 0.5))
 
     assert found.bytes < reached.bytes
