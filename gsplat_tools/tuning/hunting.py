@@ -21,7 +21,7 @@ _REPEATS = 20
 
 LARGE = 1 << 16
 """Splats from which fewer rounds are made, and presets finer than one that is larger already are not tried."""
-_LARGE_ROUNDS = 4
+_LARGE_ROUNDS = 6
 _STEPS = 4
 """Coarser values of a knob that are tried on top of a preset."""
 

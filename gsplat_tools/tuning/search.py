@@ -26,7 +26,7 @@ TARGET_VIEWS, TARGET_SIZE = 8, (640, 360)
 """Views that a PSNR target is held at where none are asked for: those of `compare`."""
 
 SEARCH_SPLATS = 1 << 16
-"""Scenes a quarter larger are searched on a ball of so many splats around their middle, and verified whole."""
+"""Scenes half as large again are searched on a ball of so many splats around their middle, and verified whole."""
 SEARCH_FRAMES = 3
 """Frames at the start of a sequence that stand for it while searching."""
 
@@ -171,7 +171,7 @@ def _part(scene: GaussianCloud | GaussianSequence) -> GaussianCloud | GaussianSe
     from gsplat_tools.ops.sampling import crop
 
     if isinstance(scene, GaussianCloud):
-        return crop(scene, SEARCH_SPLATS, keeps_box=True) if len(scene) > 1.25 * SEARCH_SPLATS else scene
+        return crop(scene, SEARCH_SPLATS, keeps_box=True) if len(scene) > 1.5 * SEARCH_SPLATS else scene
     frames = [scene.frame(frame_id) for frame_id in range(min(SEARCH_FRAMES, len(scene)))]
     return GaussianSequence(frames.__getitem__, num_splats=scene.num_splats, sh_degree=scene.sh_degree, num_frames=len(frames))
 
