@@ -28,9 +28,9 @@ def cases(format_id: str, start: int, stop: int) -> Iterator[Case]:
     position = 0
     for seed, count in systematic_counts(format_id):
         if start < position + count and position < stop:
-            for offset, (what, data) in enumerate(_sealed(seed)):
+            for offset, (what, data, is_sealed) in enumerate(_whole(seed)):
                 if start <= position + offset < stop:
-                    yield Case(position + offset, seed, what, data)
+                    yield Case(position + offset, seed, what, data if is_sealed else seed.seal(data))
         position += count
     for index in range(max(start, position), stop):
         yield make_mutant(format_id, index)
@@ -50,17 +50,12 @@ def make_mutant(format_id: str, index: int) -> Case:
     return Case(index, seed, "mutant", seed.seal(mutant(seed, rng)))
 
 
-def _sealed(seed: Seed) -> Iterator[tuple[str, bytes]]:
-    """Yield the systematic cases of a seed, its relatives first."""
-    yield from seed.named()
-    yield from seed.relatives()
+def _whole(seed: Seed) -> Iterator[tuple[str, bytes, bool]]:
+    """Yield the systematic cases of a seed and whether each is sealed already, which takes time; its relatives first."""
+    for what, data in chain(seed.named(), seed.relatives()):
+        yield what, data, True
     for what, data in systematic(seed):
-        yield what, seed.seal(data)
-
-
-def _unsealed(seed: Seed) -> Iterator[tuple[str, bytes]]:
-    """Yield as many as `_sealed` does, without the work of sealing."""
-    return chain(seed.named(), seed.relatives(), systematic(seed))
+        yield what, data, False
 
 
 def named(format_id: str) -> Iterator[Case]:
@@ -81,7 +76,7 @@ def relatives(format_id: str) -> Iterator[Case]:
 @cache
 def systematic_counts(format_id: str) -> tuple[tuple[Seed, int], ...]:
     """Return each seed and how many systematic cases it gives."""
-    return tuple((seed, sum(1 for _ in _unsealed(seed))) for seed in seeds_of(format_id))
+    return tuple((seed, sum(1 for _ in _whole(seed))) for seed in seeds_of(format_id))
 
 
 def num_systematic(format_id: str) -> int:
@@ -96,9 +91,9 @@ def sample(format_id: str, count: int) -> Iterator[Case]:
     chosen = {total * i // wanted for i in range(wanted)}
     position = 0
     for seed, number in systematic_counts(format_id):
-        for offset, (what, data) in enumerate(_sealed(seed)):
+        for offset, (what, data, is_sealed) in enumerate(_whole(seed)):
             if position + offset in chosen:
-                yield Case(position + offset, seed, what, data)
+                yield Case(position + offset, seed, what, data if is_sealed else seed.seal(data))
         position += number
     for index in range(total, total + count - wanted):
         yield make_mutant(format_id, index)
