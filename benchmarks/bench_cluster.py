@@ -73,7 +73,7 @@ class Costs:
             "look, draw": max(count * self.look / min(workers, frames), wire(2)),
             "fit": self.fit,
             "encode": max(rounds * min(SEGMENT, frames) * splats * self.encode, wire(1)),
-            "assemble": count * self.bundle * max(self.assemble, 2 / STORE_CONNECTION if nodes else 0.0),
+            "assemble": count * self.bundle * (2 / STORE_CONNECTION if nodes else self.assemble),
         }
 
 
@@ -153,7 +153,7 @@ def main() -> None:
     print(f"traffic: {frames * splats * costs.source * costs.passes / 1e12:.1f} TB read, "
           f"{2 * frames * splats * costs.bundle / 1e12:.2f} TB written (parts, bundle), requests {requests:.0f} $")  # fmt: skip
     print(
-        f"a node: {CORES} cores, {PRICE} $ an hour, {NETWORK * 8 / 1e9:.0f} Gbit/s; {STORE_CONNECTION / 1e6:.0f} MB/s a stream (assumed)"
+        f"a node: {CORES} cores, {PRICE} $ an hour, {NETWORK * 8 / 1e9:.0f} Gbit/s, {STORE_CONNECTION / 1e6:.0f} MB/s a stream"
     )
 
 
