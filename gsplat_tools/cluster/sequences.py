@@ -7,7 +7,6 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,32 +14,28 @@ from typing import Any
 import numpy as np
 
 from gsplat_tools.cluster import tasks
+from gsplat_tools.cluster.assembling import assemble, check_published, folder_of_parts, remove_parts
 from gsplat_tools.cluster.checking import Checks, merged_tally
 from gsplat_tools.cluster.engines import Dask, Engine
 from gsplat_tools.cluster.outcomes import Outcome, warn_again
-from gsplat_tools.cluster.parts import Part, part_bytes
+from gsplat_tools.cluster.parts import Part
 from gsplat_tools.comparison.rendered import summarize_views
 from gsplat_tools.convert import ConversionReport, unique_warnings
-from gsplat_tools.errors import CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError, WriteError
-from gsplat_tools.formats._atomic import replacing
+from gsplat_tools.errors import CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError
 from gsplat_tools.formats._limits import max_memory
-from gsplat_tools.formats._stores import LARGE_BLOCK_BYTES, exists, is_url, local_path, remove, replacing_object, url_of
-from gsplat_tools.formats._zip import ZipWriter
+from gsplat_tools.formats._stores import exists, is_url, local_path, url_of
 from gsplat_tools.formats.loading import inspect_file
 from gsplat_tools.formats.preparing import SaveChoices
 from gsplat_tools.formats.preparing_frames import Kept, kept_splats, with_scan
-from gsplat_tools.formats.saving import DEFAULT_PRESET, check_header, find_target, split_options
+from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, split_options
 from gsplat_tools.formats.sequences import frame_files
 from gsplat_tools.formats.sog4d.codebooks import Shared
 from gsplat_tools.formats.sog4d.encode import choose_layout, choose_times, last_entries, warn_clipped
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
-from gsplat_tools.formats.sog4d.segments import choose_segments, data_compression, has_deltas
+from gsplat_tools.formats.sog4d.segments import choose_segments, has_deltas
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
 from gsplat_tools.verification import DEFAULT_VALIDATION, VALIDATED_FRAMES, Validation
-
-PARTS_SUFFIX = ".gsplat-parts"
-"""Added to the target's name, with a dot before it: the folder of finished segments."""
 
 _TASKS_A_WORKER = 8
 _MOST_FRAMES = 64
@@ -153,7 +148,7 @@ def convert_sequence(
         job = _Job(source, choices, write_options, stages, _checks(record.model, len(files), validation))
         kept, fit, shared = job.fit()
         looked = time.perf_counter()
-        folder = _folder_of_parts(target, parts)
+        folder = folder_of_parts(target, parts)
         found = job.encode(fit, shared, folder)
         encoded = time.perf_counter()
         busy = [sum(part.seconds.get(name, 0) for part in found) for name in ("validate", "read", "encode", "write")]
@@ -165,10 +160,12 @@ def convert_sequence(
         shared_here: Shared = next(iter(stages.run("collect", "fetching codebooks", [shared], [0])))
         num_splats = int(np.count_nonzero(kept.keeps))
         entries = last_entries(shared_here, num_splats, job.segments, times, facts, uses_deltas=job.uses_deltas)
-        size, digest = _assemble(target, found, entries, shared_here, overwrite=overwrite, stages=stages)
+        start = time.perf_counter()
+        size, digest = assemble(target, found, entries, shared_here, overwrite=overwrite)
+        stages.note("assemble", seconds=time.perf_counter() - start, bytes=size)
         if not is_url(target):
-            _check_published(target, num_splats, len(files), shared_here.bands)
-        _remove_parts(folder)
+            check_published(target, num_splats, len(files), shared_here.bands)
+        remove_parts(folder)
     return SequenceReport(
         source=", ".join(map(url_of, sources)),
         source_format=first_record.id,
@@ -331,116 +328,3 @@ def _judge(found: list[Part], validation: Validation | None, model: tuple[str, s
         )
     tally = merged_tally([part.tally for part in found if part.tally is not None])
     return {**result, "attributes": tally.to_json(), "passed": True}
-
-
-class _Hashed:
-    """A stream that is written from start to end, and its SHA-256."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-        self.digest = hashlib.sha256()
-        self.size = 0
-
-    def seekable(self) -> bool:
-        return False
-
-    def tell(self) -> int:
-        return self.size
-
-    def write(self, data: bytes) -> int:
-        self._stream.write(data)
-        self.digest.update(data)
-        self.size += len(data)
-        return len(data)
-
-    def flush(self) -> None:
-        pass
-
-
-def _assemble(
-    target: Path, found: list[Part], entries: dict[str, bytes], shared: Shared, *, overwrite: bool, stages: _Stages
-) -> tuple[int, str]:
-    """Write the bundle from its parts, in the order of frames, and publish it; return its size and SHA-256."""
-    start = time.perf_counter()
-    with stage("writing", len(found), "segments") as progress, _opened(target, overwrite=overwrite) as stream:
-        hashed = _Hashed(stream)
-        archive = ZipWriter(hashed)  # type: ignore[arg-type] # all that is needed of a stream
-        for part in found:
-            images = [entry for entry in part.entries if entry.name.startswith("frames/")]
-            archive.graft(images, _moved(part, 0, part.images))
-            progress.advance(1)
-        deltas = {name: part for part in found for name in part.deltas}
-        for name in sorted([*entries, *deltas]):
-            if name in entries:
-                _add(archive, name, entries[name], shared)
-            else:
-                part = deltas[name]
-                offset, size = part.deltas[name]
-                own = [entry for entry in part.entries if entry.name == name]
-                archive.graft(own, _moved(part, offset, size), start=offset)
-        archive.close()
-        size = hashed.size
-    stages.note("assemble", seconds=time.perf_counter() - start, bytes=size)
-    return size, hashed.digest.hexdigest()
-
-
-def _moved(part: Part, start: int, size: int) -> Iterator[bytes]:
-    """Yield bytes of a part, saying what to do where it went missing."""
-    try:
-        yield from part_bytes(part.path, start, size)
-    except FileNotFoundError as error:
-        message = "a finished segment is gone; is the folder of parts one that all workers and this machine share? See --parts"
-        raise ClusterError(message, path=part.path) from error
-
-
-def _add(archive: ZipWriter, name: str, data: bytes, shared: Shared) -> None:
-    """Append an entry without seeking: made in memory, then moved."""
-    import io
-
-    alone = io.BytesIO()
-    writer = ZipWriter(alone)
-    writer.add(name, data, data_compression(shared.options))
-    archive.graft(writer.entries, [alone.getvalue()[: writer.size]])
-
-
-def _opened(target: Path, *, overwrite: bool) -> AbstractContextManager[Any]:
-    """Open what takes the place of the target when it is whole."""
-    if is_url(target):
-        return replacing_object(target, overwrite=overwrite, block_bytes=LARGE_BLOCK_BYTES)
-    return replacing(target, overwrite=overwrite)
-
-
-def _check_published(target: Path, num_splats: int, num_frames: int, bands: int) -> None:
-    """Hold the header of the bundle against what it was made from."""
-    expected = GaussianSequence(_no_frame, num_splats=num_splats, sh_degree=bands, num_frames=num_frames)
-    with target.open("rb") as stream:
-        check_header(stream, tasks.FORMAT, expected)
-
-
-def _no_frame(_frame_id: int) -> Any:
-    raise AssertionError("a header needs no frame")
-
-
-def _folder_of_parts(target: Path, parts: str | None) -> str:
-    """Return a folder that holds the parts of this target and nothing else."""
-    whole = url_of(target) if is_url(target) else str(target.absolute())
-    place, _, name = whole.replace("\\", "/").rpartition("/")
-    if parts is None:
-        return f"{place}/.{name}{PARTS_SUFFIX}"
-    own = f"{name}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}{PARTS_SUFFIX}"
-    return f"{url_of(parts).rstrip('/') if is_url(parts) else Path(local_path(parts)).absolute()}/{own}"
-
-
-def _remove_parts(folder: str) -> None:
-    """Remove parts that are no longer needed; what cannot be removed only takes room."""
-    try:
-        if is_url(folder):
-            remove(folder)
-            return
-        for path in Path(folder).iterdir():
-            if path.suffix in (".part", ".gsplat-tmp"):
-                path.unlink(missing_ok=True)
-        with suppress(OSError):
-            Path(folder).rmdir()
-    except (OSError, WriteError) as error:
-        warnings.warn(GsplatWarning(f"finished segments could not be removed: {error}", code="parts-left"), stacklevel=3)

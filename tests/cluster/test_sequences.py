@@ -145,7 +145,7 @@ def test_a_run_that_ended_early__is_continued(tmp_path: Path, monkeypatch: pytes
 def test_a_part_that_is_cut_off_anywhere__is_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pattern = make_frames(tmp_path / "frames", 2, 20)
     kept: dict[str, bytes] = {}
-    monkeypatch.setattr("gsplat_tools.cluster.sequences._remove_parts", lambda folder: kept.update(
+    monkeypatch.setattr("gsplat_tools.cluster.sequences.remove_parts", lambda folder: kept.update(
         {path.name: path.read_bytes() for path in Path(folder).iterdir()}
     ))  # fmt: skip
     convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), validation=None, **SHORT)
@@ -162,7 +162,7 @@ def test_a_part_that_is_cut_off_anywhere__is_no_part(tmp_path: Path, monkeypatch
 
 def test_a_source_that_changed__is_encoded_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pattern = make_frames(tmp_path / "frames", 6, 60)
-    monkeypatch.setattr("gsplat_tools.cluster.sequences._remove_parts", lambda folder: None)
+    monkeypatch.setattr("gsplat_tools.cluster.sequences.remove_parts", lambda folder: None)
     convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), validation=None, **SHORT)
     save(random_cloud(60, sh_degree=1, seed=9), tmp_path / "frames/4.ply", overwrite=True)
 
