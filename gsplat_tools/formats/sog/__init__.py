@@ -119,10 +119,10 @@ FORMAT = Format(
     read_options=SogReadOptions,
     write_options=SogOptions,
     presets={
-        "fast": {"rotation": "small", "webp_effort": 1, "palette_rounds": 1},
+        "fast": {"webp_effort": 1, "palette_rounds": 1},
         "balanced": {},
-        "best": {"palette_rounds": 8, "webp_effort": 9},
-        "exact": {"sh_palette_size": 65536, "palette_rounds": 8, "webp_effort": 9},
+        "best": {"rotation": "best", "palette_rounds": 8, "webp_effort": 9},
+        "exact": {"rotation": "best", "sh_palette_size": 65536, "palette_rounds": 8, "webp_effort": 9},
     },
     knobs=KNOBS,
     model=("spark", None),

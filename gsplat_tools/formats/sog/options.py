@@ -53,7 +53,7 @@ class SogOptions:
     """
 
     sh_palette_size: int | None = None
-    rotation: RotationMode = "best"
+    rotation: RotationMode = "small"
     palette_rounds: int = 5
     webp_effort: int = DEFAULT_EFFORT
     visual_tolerance: float = 0.0
