@@ -25,7 +25,7 @@ from tests.builders import PlyElement, ply_file, splat_columns
 from tests.builders_spz import SpzFile, random_file
 from tests.clouds import random_cloud
 from tests.formats.sog_files import archive, edited, version_2
-from tests.hostile.corpus import seal_gspk, written
+from tests.hostile.corpus import seal_gspk, written_files
 from tests.sog4d_bundles import archive as sog4d_archive
 from tests.sog4d_bundles import valid_files, valid_meta
 
@@ -124,7 +124,7 @@ def test_splats_that_are_all_alike__are_read_up_to_16_mib_and_beyond_with_leave(
 
 
 def test_gspk_description_beyond_the_end_of_numbers__is_refused() -> None:
-    data = bytearray(written(FORMATS["spark"], sh_degree=1))
+    data = bytearray(written_files(FORMATS["spark"], {"sh_degree": 1})[0])
     data[16:32] = (1 << 63).to_bytes(8, "little") + bytes(8)
 
     with pytest.raises(CorruptDataError) as caught:
