@@ -1,8 +1,9 @@
-"""JSON from outside: its size and depth are held against limits, so that no few bytes become many objects."""
+"""JSON from outside, held against limits of size and depth, so that no few bytes become many objects; and values made fit for it."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -66,3 +67,14 @@ def shown(value: Any) -> str:
         return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+def finite(value: Any) -> Any:
+    """Return JSON values with None for every number that JSON cannot hold."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return value

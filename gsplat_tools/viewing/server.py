@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import math
 import shutil
 import sys
 from http import HTTPStatus
@@ -12,6 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from gsplat_tools.errors import GsplatError
+from gsplat_tools.formats._json import finite
 from gsplat_tools.validation import validate
 from gsplat_tools.viewing.page import served_page
 from gsplat_tools.viewing.payload import Exhibit
@@ -92,7 +92,7 @@ class _Handler(BaseHTTPRequestHandler):
                 report: dict[str, Any] = validate(reports[path])
             except GsplatError as error:
                 report = {"issues": [{"severity": "error", "code": "unreadable", "message": str(error)}]}
-            self._answer(json.dumps(_finite(report)).encode("utf-8"), "application/json")
+            self._answer(json.dumps(finite(report)).encode("utf-8"), "application/json")
         else:
             self._refuse(HTTPStatus.NOT_FOUND)
 
@@ -122,12 +122,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, *_: Any) -> None:
         """Say nothing: requests are not news."""
-
-
-def _finite(value: Any) -> Any:
-    """Return JSON values with None for numbers that are not finite."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    return [_finite(item) for item in value] if isinstance(value, list | tuple) else value

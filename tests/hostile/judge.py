@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_tools.chunks import CloudChunks
-from gsplat_tools.cli._output import finite
 from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning, UnknownFormatError
 from gsplat_tools.formats import load
+from gsplat_tools.formats._json import finite
 from gsplat_tools.formats._limits import use_max_memory
 from gsplat_tools.formats.base import FileInfo, Format
 from gsplat_tools.formats.loading import located, open_as, open_scene
