@@ -1,4 +1,4 @@
-"""JSON from outside, held against limits of size and depth, so that no few bytes become many objects; and values made fit for it."""
+"""JSON from outside, held against limits so that few bytes become no crowd of objects; and values made fit for JSON."""
 
 from __future__ import annotations
 
