@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CloudError
+from gsplat_tools.formats.sog4d import balancing
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
-from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, MAX_CODEBOOK, SH0_ENTRIES
-from gsplat_tools.ops.visibility import MOST, Tolerance, viewpoint
+from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, SH0_ENTRIES
+from gsplat_tools.ops.visibility import Tolerance, viewpoint
 from gsplat_tools.parallel import run_blocks
 
 Float32 = NDArray[np.float32]
@@ -41,8 +42,8 @@ _SCALE_GRID = 0.7
 _CENTROID_GRID = 0.5
 _FINE_STEP = 0.03
 
-_ENTRY_BITS = 40.0
-"""Of the text of a scale triple, deflated."""
+DEFAULT_SH0_ENTRIES, DEFAULT_ROTATION_STEPS = 128, 64
+"""Where neither the options nor a visual tolerance say otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,18 +172,28 @@ def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layo
     log_scales = sample.log_scales if frames is None else -np.sort(-sample.log_scales, axis=1)
     size = options.scale_codebook_size or int(options.detail * default_scale_size(len(first)))
     codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), size)
+    entries, steps = options.sh0_entries or DEFAULT_SH0_ENTRIES, options.rotation_steps or DEFAULT_ROTATION_STEPS
     tolerance = Tolerance(options.visual_tolerance, viewpoint(first)) if options.visual_tolerance > 0 else None
-    if tolerance is not None and options.scale_codebook_size is None:
-        size = _balanced_scale_size(codebook, first, turned(first, frames)[1], tolerance)
-        codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), size)
+    if tolerance is not None:
+        quats, own_scales = turned(first, frames)
+        costs = tolerance.costs(first, own_scales)
+        if options.scale_codebook_size is None:
+            with np.errstate(divide="ignore"):
+                points = scale_coordinates(np.log(codebook))
+            size = balancing.scale_size(points, scale_coordinates(own_scales), costs)
+            codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), size)
+        if options.sh0_entries is None:
+            entries = balancing.color_entries(lambda count: _fit_sh0(sample, count), first.sh0, costs)
+        if options.rotation_steps is None and options.rotation == "small":
+            steps = balancing.rotation_steps(quats, costs)
     return Shared(
-        options=options,
+        options=replace(options, sh0_entries=entries, rotation_steps=steps),
         width=layout[0],
         height=layout[1],
         bands=first.sh_degree,
         scale_codebook=codebook,
         scale_error=error,
-        sh0_codebook=BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, options.sh0_entries),
+        sh0_codebook=BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, entries),
         palettes=_fit_palettes(sample, first.sh_degree, len(first), options),
         rotation_frames=frames,
         is_long=long_splats(first) if options.rotation == "small" else None,
@@ -233,23 +244,6 @@ def turned(cloud: GaussianCloud, frames: NDArray[np.uint8] | None) -> tuple[Floa
     quats, log_scales = np.empty_like(cloud.quats), np.empty_like(cloud.log_scales)
     apply_frames(cloud.quats, cloud.log_scales, frames, quats, log_scales)
     return quats, log_scales
-
-
-def _balanced_scale_size(codebook: Float32, cloud: GaussianCloud, log_scales: Float32, tolerance: Tolerance) -> int:
-    """Return the size, at least the given, at which one more entry saves in what shows what it costs in bits.
-
-    Between them, N splats pay log2 K bits each for their label and the text of K entries; what shows falls as 1 / K.
-    """
-    from gsplat_tools.codecs.palette import nearest_labels
-
-    with np.errstate(divide="ignore"):
-        entries = scale_coordinates(np.log(codebook))
-    _, squares = nearest_labels(scale_coordinates(log_scales), entries)
-    shown = float(np.minimum(tolerance.costs(cloud, log_scales).scale * squares, MOST).sum())
-    # The root of a K^2 + b K = shown x size: the derivatives balance.
-    a, b = _ENTRY_BITS, len(cloud) / np.log(2)
-    size = (np.sqrt(b * b + 4 * a * shown * len(codebook)) - b) / (2 * a)
-    return int(np.clip(size, len(codebook), max(len(codebook), min(4 * len(codebook), MAX_CODEBOOK))))
 
 
 def _fit_scales(log_scales: Float32, weights: Float32, size: int) -> tuple[Float32, float]:
