@@ -37,9 +37,9 @@ _SCALE_FACTOR = 8.0
 _TURN_FACTOR = 3.0
 
 # Leaving out a splat saves about ten bytes in .sog4d and .sog. Neighbors go together and all darken the picture, so that
-# what they show adds up: counted twice, half as much and twice as much cost more at equal bytes (docs/visual-tolerance.md).
+# what they show adds up. Counted 3 times; 2 and 4 suit some scenes better and others worse (docs/visual-tolerance.md).
 _SPLAT_BITS = 80.0
-_FAINT_FACTOR = 2.0
+_FAINT_FACTOR = 3.0
 
 # Of float32 and of float64 differences of large numbers.
 _ROUNDING = 1e-5

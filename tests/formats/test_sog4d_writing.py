@@ -12,11 +12,11 @@ import pytest
 
 from gsplat_tools.attributes.quaternions import to_matrix
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.codecs.quaternion_u8 import encode_constant_w
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
 from gsplat_tools.formats.sog4d import Sog4dOptions, Sog4dReadOptions, read, write
 from gsplat_tools.formats.sog4d.bounds import rotation_bound
 from gsplat_tools.formats.sog4d.codebooks import falling_frames, scale_coordinates, scales_at, turned
-from gsplat_tools.codecs.quaternion_u8 import encode_constant_w
 from gsplat_tools.parallel import use_jobs
 from tests.clouds import random_cloud
 
