@@ -26,9 +26,9 @@ _COLOR_BITS = 2.5
 _ROTATION_BITS = 5.0
 """A splat."""
 
-# From half of what there is without a tolerance: below that, errors of neighbors are alike and no longer average out.
-_ENTRIES = (64, 80, 96, 128)
-_STEPS = (32, 40, 48, 56, 64)
+# Not far below what there is without a tolerance: there, errors of neighbors are alike and no longer average out.
+_ENTRIES = (48, 64, 80, 96, 128)
+_STEPS = (40, 48, 56, 64)
 
 _PROBES = 20_000
 
