@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, Protocol, cast
 
-from gsplat_tools.cluster.outcomes import Outcome, is_passing, run_task
+from gsplat_tools.cluster.outcomes import Outcome, Settings, is_passing, run_task
 from gsplat_tools.errors import CapabilityError, ClusterError, MissingDependencyError
 from gsplat_tools.parallel import num_jobs
 
@@ -65,7 +65,7 @@ class InProcess:
     dashboard: str | None = None
 
     def __init__(self, jobs: int | None = None, retries: int = DEFAULT_RETRIES) -> None:
-        self._jobs, self._retries = jobs, retries
+        self._settings, self._retries = Settings(jobs), retries
         self.retried = 0
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> _Task:
@@ -90,7 +90,7 @@ class InProcess:
             given = [self._outcome(each) if isinstance(each, _Task) else each for each in task.arguments]
             for attempt in itertools.count():
                 try:
-                    task.outcome = run_task(task.function, self._jobs, *given)
+                    task.outcome = run_task(task.function, self._settings, *given)
                     break
                 except Exception as error:
                     if attempt >= self._retries or not is_passing(error):
@@ -110,7 +110,7 @@ class Processes:
         self.name = f"local:{workers}"
         self.workers = workers
         self.retried = 0
-        self._jobs = jobs or max(1, num_jobs() // workers)
+        self._settings = Settings(jobs or max(1, num_jobs() // workers))
         self._retries = retries
         self._unfinished: list[_Task] = []
         self._start()
@@ -151,7 +151,7 @@ class Processes:
 
     def _send(self, task: _Task) -> None:
         with suppress(BrokenProcessPool):
-            task.future = self._pool.submit(run_task, task.function, self._jobs, *task.arguments)
+            task.future = self._pool.submit(run_task, task.function, self._settings, *task.arguments)
             return
         self._restart(task)
 
@@ -164,14 +164,14 @@ class Processes:
             self._run_alone(task)
         self._start()
         for each in self._unfinished:
-            each.future = self._pool.submit(run_task, each.function, self._jobs, *each.arguments)
+            each.future = self._pool.submit(run_task, each.function, self._settings, *each.arguments)
 
     def _run_alone(self, task: _Task) -> None:
         """Run a task in a process of its own, to tell whether it is this one that ends processes."""
         self._unfinished.remove(task)
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             try:
-                task.outcome = pool.submit(run_task, task.function, self._jobs, *task.arguments).result()
+                task.outcome = pool.submit(run_task, task.function, self._settings, *task.arguments).result()
             except BrokenProcessPool as error:
                 task.outcome = Outcome(
                     error=ClusterError(f"the task ended its process {task.tries + 1} times, for want of memory most likely")
@@ -231,7 +231,7 @@ class Dask:
             self._client.wait_for_workers(1, timeout=60)
         except (OSError, TimeoutError) as error:
             raise ClusterError(f"no scheduler answers at {address}, or it has no workers: {error}") from error
-        self._jobs = jobs
+        self._settings = Settings(jobs)
         self.workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
         self.dashboard = self._client.dashboard_link
 
@@ -239,7 +239,7 @@ class Dask:
         """Hand in a task."""
         with self._explained():
             return self._client.submit(
-                run_task, function, self._jobs, *arguments, retries=self._retries, pure=False, key=_key(function)
+                run_task, function, self._settings, *arguments, retries=self._retries, pure=False, key=_key(function)
             )
 
     def results(self, pending: Sequence[Any]) -> Iterator[Outcome]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsplat_tools.errors import GsplatWarning, ReadError, WriteError
+from gsplat_tools.formats._store_requests import store_timeout, use_store_timeout
 from gsplat_tools.parallel import use_jobs
 
 # Tasks use all the threads they are given by themselves, and the list of warnings is one for all threads of a process.
@@ -39,11 +40,28 @@ def is_passing(error: BaseException) -> bool:
     )
 
 
-def run_task(function: Callable[..., Any], jobs: int | None, *arguments: Any) -> Outcome:
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What a task takes over from the process that hands it in.
+
+    Parameters
+    ----------
+    jobs
+        Threads; None leaves it to the machine.
+    store_timeout
+        As `use_store_timeout` takes it.
+    """
+
+    jobs: int | None
+    store_timeout: float = field(default_factory=store_timeout)
+
+
+def run_task(function: Callable[..., Any], settings: Settings, *arguments: Any) -> Outcome:
     """Run a task; errors that may pass are raised, so that the engine tries again, others are returned."""
     given = [each.result() if isinstance(each, Outcome) else each for each in arguments]
     start = time.perf_counter()
-    with _alone, use_jobs(jobs), warnings.catch_warnings(record=True) as caught:
+    within = use_store_timeout(settings.store_timeout)
+    with _alone, use_jobs(settings.jobs), within, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", GsplatWarning)
         outcome = Outcome()
         try:

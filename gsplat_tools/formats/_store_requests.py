@@ -167,7 +167,7 @@ def _gs_timeout(seconds: float) -> Any:
 
 
 def ask(
-    system: Any, method: str, *arguments: Any, size: int = 0, is_slow: bool = False, tries: int = TRIES, **named: Any
+    system: Any, method: str, *arguments: Any, size: int = 0, is_slow: bool = False, tries: int | None = None, **named: Any
 ) -> Any:
     """Call a method of a file system, which ends after the tries and the time of this module.
 
@@ -180,7 +180,7 @@ def ask(
     is_slow
         Whether stores take long for it.
     tries
-        Times that it is made before it is given up.
+        Times that it is made before it is given up; TRIES by default.
     """
     function = getattr(system, method)
     if not getattr(system, "async_impl", False):
@@ -226,8 +226,9 @@ def _allowed(size: int, patience: int = 1) -> float:
     return store_timeout() * patience + size / SLOWEST
 
 
-def _tried(function: Callable[..., Any], *arguments: Any, seconds: float, tries: int = TRIES, **named: Any) -> Any:
+def _tried(function: Callable[..., Any], *arguments: Any, seconds: float, tries: int | None = None, **named: Any) -> Any:
     """Call what takes a timeout, again after errors that may pass."""
+    tries = tries or TRIES
     for attempt in range(tries):
         try:
             return function(*arguments, timeout=seconds, **named)

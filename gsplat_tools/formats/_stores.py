@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsplat_tools.errors import GsplatError, ReadError, TargetExistsError, WriteError
-from gsplat_tools.formats._store_requests import TRIES, ask, fetch, file_system, in_words
+from gsplat_tools.formats._store_requests import ask, fetch, file_system, in_words
 
 BLOCK_BYTES = 8 << 20
 """Bytes of a range that is read, and of a part that is written: a store takes 10,000 parts, and none below 5 MiB."""
@@ -227,7 +227,7 @@ class ObjectWriter(io.RawIOBase):
             )
         super().close()
 
-    def _published(self, tries: int = TRIES) -> dict[str, Any] | None:
+    def _published(self, tries: int | None = None) -> dict[str, Any] | None:
         """Return what the store says about the object, None where there is none."""
         self._system.invalidate_cache(self._path.rpartition("/")[0])
         with suppress(FileNotFoundError):
