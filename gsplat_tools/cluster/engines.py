@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 import re
+import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
@@ -23,6 +26,9 @@ DEFAULT_RETRIES = 3
 
 _FIRST_PAUSE = 0.2
 """Seconds before a task is tried again in a process of this machine; doubled each time."""
+
+_END_SECONDS = 7.0
+"""Seconds that a process has to drop what it has half done; a store that hangs takes five of them."""
 
 LOST = "the same command continues: segments and scenes that are finished are kept"
 
@@ -142,16 +148,27 @@ class Processes:
                     del left[index]
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes; those that are busy are told to drop what they have half done, which may take seconds."""
+        processes = list((self._pool._processes or {}).values())
+        busy = any(each.future is not None and not each.future.done() for each in self._unfinished)
         self._pool.shutdown(wait=False, cancel_futures=True)
+        if not busy:
+            return
+        for process in processes:
+            process.terminate()
+        end = time.monotonic() + _END_SECONDS
+        for process in processes:
+            process.join(max(0.0, end - time.monotonic()))
+            if process.is_alive():
+                process.kill()
 
     def _start(self) -> None:
         # Threads of this process make a fork unsafe.
-        self._pool = ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"))
+        self._pool = _pool(self.workers)
 
     def _send(self, task: _Task) -> None:
         with suppress(BrokenProcessPool):
-            task.future = self._pool.submit(run_task, task.function, self._settings, *task.arguments)
+            task.future = self._pool.submit(_run_here, task.function, self._settings, *task.arguments)
             return
         self._restart(task)
 
@@ -164,14 +181,14 @@ class Processes:
             self._run_alone(task)
         self._start()
         for each in self._unfinished:
-            each.future = self._pool.submit(run_task, each.function, self._settings, *each.arguments)
+            each.future = self._pool.submit(_run_here, each.function, self._settings, *each.arguments)
 
     def _run_alone(self, task: _Task) -> None:
         """Run a task in a process of its own, to tell whether it is this one that ends processes."""
         self._unfinished.remove(task)
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with _pool(1) as pool:
             try:
-                task.outcome = pool.submit(run_task, task.function, self._settings, *task.arguments).result()
+                task.outcome = pool.submit(_run_here, task.function, self._settings, *task.arguments).result()
             except BrokenProcessPool as error:
                 task.outcome = Outcome(
                     error=ClusterError(f"the task ended its process {task.tries + 1} times, for want of memory most likely")
@@ -197,6 +214,24 @@ class Processes:
                 time.sleep(_FIRST_PAUSE * 2**task.tries)
                 self._send(task)
         return task.outcome
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_obey_parent)
+
+
+def _obey_parent() -> None:
+    """Leave Ctrl-C to the parent, which ends this process by SIGTERM."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+
+
+def _run_here(function: Callable[..., Any], settings: Settings, *arguments: Any) -> Outcome:
+    """Run a task in a process of a pool; SIGTERM unwinds it, so that what is half done is dropped, and ends the process."""
+    try:
+        return run_task(function, settings, *arguments)
+    except SystemExit as end:
+        os._exit(int(end.code or 0))  # the pool would take it for a result and start the next task
 
 
 class Dask:
