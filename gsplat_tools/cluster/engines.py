@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import os
 import re
 import signal
@@ -12,25 +11,23 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
-from gsplat_tools.cluster.outcomes import Outcome, Settings, is_passing, run_task
-from gsplat_tools.errors import CapabilityError, ClusterError, MissingDependencyError
+from gsplat_tools.cluster.on_dask import Dask
+from gsplat_tools.cluster.outcomes import DEFAULT_RETRIES, Outcome, Settings, caught, is_passing, run_task
+from gsplat_tools.errors import CapabilityError, ClusterError
 from gsplat_tools.parallel import num_jobs
 
-DEFAULT_RETRIES = 3
-"""Times that a task is tried again after an error that may pass, or after its worker died."""
+__all__ = ["DEFAULT_RETRIES", "Dask", "Engine", "InProcess", "Processes", "open_engine"]
 
 _FIRST_PAUSE = 0.2
 """Seconds before a task is tried again in a process of this machine; doubled each time."""
 
 _END_SECONDS = 7.0
 """Seconds that a process has to drop what it has half done; a store that hangs takes five of them."""
-
-LOST = "the same command continues: segments and scenes that are finished are kept"
 
 
 class Engine(Protocol):
@@ -86,7 +83,7 @@ class InProcess:
     def completed(self, pending: Sequence[_Task]) -> Iterator[tuple[int, Outcome | Exception]]:
         """Run the tasks."""
         for index, task in enumerate(pending):
-            yield index, _caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
+            yield index, caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
 
     def close(self) -> None:
         """Nothing is held."""
@@ -144,7 +141,7 @@ class Processes:
             for index in ended:
                 task = left[index]
                 if task.future is not None and task.future.done():  # not handed in again meanwhile
-                    yield index, _caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
+                    yield index, caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
                     del left[index]
 
     def close(self) -> None:
@@ -232,127 +229,6 @@ def _run_here(function: Callable[..., Any], settings: Settings, *arguments: Any)
         return run_task(function, settings, *arguments)
     except SystemExit as end:
         os._exit(int(end.code or 0))  # the pool would take it for a result and start the next task
-
-
-class Dask:
-    """Runs tasks on Dask: a cluster of this machine, or one that is running."""
-
-    def __init__(self, address: str, jobs: int | None = None, retries: int = DEFAULT_RETRIES) -> None:
-        try:
-            import distributed as imported
-        except ImportError as error:
-            raise MissingDependencyError(
-                "a cluster needs dask.distributed; install it with pip install 'gsplat_tools[cluster]'"
-            ) from error
-        self._cluster: Any = None
-        distributed: Any = imported
-        self._distributed = distributed
-        self._retries = retries
-        self.name = address
-        self.retried = 0
-        local = re.fullmatch(r"local-cluster:(\d+)", address)
-        try:
-            if local:
-                count = int(local[1])
-                jobs = jobs or max(1, num_jobs() // count)
-                self._cluster = distributed.LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs="CRITICAL",
-                )
-            self._client = distributed.Client(self._cluster or address, set_as_default=False)
-            self._client.wait_for_workers(1, timeout=60)
-        except (OSError, TimeoutError) as error:
-            raise ClusterError(f"no scheduler answers at {address}, or it has no workers: {error}") from error
-        self._settings = Settings(jobs)
-        self.workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
-        self.dashboard = self._client.dashboard_link
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Hand in a task."""
-        with self._explained():
-            return self._client.submit(
-                run_task, function, self._settings, *arguments, retries=self._retries, pure=False, key=_key(function)
-            )
-
-    def results(self, pending: Sequence[Any]) -> Iterator[Outcome]:
-        """Wait for the tasks; where one fails, those that are not finished are given up."""
-        try:
-            for future in pending:
-                with self._explained():
-                    outcome = future.result()
-                yield outcome
-        except BaseException:
-            with suppress(Exception):
-                self._client.cancel(list(pending), force=True)
-            raise
-
-    def completed(self, pending: Sequence[Any]) -> Iterator[tuple[int, Outcome | Exception]]:
-        """Wait for the tasks as they end."""
-        if not pending:
-            return
-        places = {future.key: index for index, future in enumerate(pending)}
-
-        def outcome(future: Any) -> Outcome:
-            with self._explained():
-                return cast("Outcome", future.result())
-
-        for future in self._distributed.as_completed(pending):
-            yield places[future.key], _caught(lambda future=future: outcome(future))  # type: ignore[misc]
-
-    def run_everywhere(self, function: Callable[[], Any]) -> list[Any]:
-        """Return what a function returns on every worker."""
-        with self._explained():
-            return list(self._client.run(function).values())
-
-    def close(self) -> None:
-        """Leave a running cluster, or end our own."""
-        # A client that lost its scheduler says so at length when it stops looking for it.
-        logger = logging.getLogger("distributed.client")
-        level = logger.level
-        logger.setLevel(logging.CRITICAL)
-        with suppress(Exception):
-            self._client.close(timeout=5)
-        logger.setLevel(level)
-        if self._cluster is not None:
-            with suppress(Exception):
-                self._cluster.close(timeout=10)
-
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Turn what Dask raises about workers and connections into our error."""
-        from asyncio import CancelledError as Cancelled
-
-        lost = (
-            CancelledError,
-            Cancelled,
-            self._distributed.comm.CommClosedError,
-            self._distributed.client.FutureCancelledError,
-        )
-        try:
-            yield
-        except self._distributed.KilledWorker as error:
-            raise ClusterError(f"a task ended its workers again and again, for want of memory most likely; {LOST}") from error
-        except lost as error:
-            raise ClusterError(f"the connection to the scheduler at {self.name} was lost; {LOST}") from error
-
-
-def _caught(function: Callable[[], Outcome]) -> Outcome | Exception:
-    """Return what a function returns, or the exception that it raises."""
-    try:
-        return function()
-    except Exception as error:
-        return error
-
-
-_numbers = itertools.count()
-
-
-def _key(function: Callable[..., Any]) -> str:
-    """Return a name for a task, which Dask's dashboard groups by what stands before the number."""
-    return f"{function.__name__.strip('_')}-{time.time_ns():x}{next(_numbers):x}"
 
 
 def open_engine(scheduler: str, jobs: int | None = None, retries: int = DEFAULT_RETRIES) -> Engine:
