@@ -86,7 +86,9 @@ class Dask:
         if not pending:
             return
         places = {future.key: index for index, future in enumerate(pending)}
-        for future in self._distributed.as_completed(pending):
+        with self._client.as_current():
+            ended = self._distributed.as_completed(pending)
+        for future in ended:
             yield places[future.key], caught(lambda future=future: self._outcome(future))  # type: ignore[misc]
 
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -125,7 +127,8 @@ class Dask:
     def _again(self, future: Any) -> Any:
         """Hand in again what another task needs, once for all that need it."""
         if future.key not in self._instead:
-            self._instead[future.key] = self.submit(*self._given[future.key])
+            function, arguments = self._given[future.key]
+            self._instead[future.key] = self.submit(function, *arguments)
         return self._instead[future.key]
 
     def _waited(self, future: Any) -> Outcome | None:
