@@ -24,7 +24,7 @@ DEFAULT_STORE_TIMEOUT = 30.0
 TRIES = 4
 """Times that a request is made before it is given up."""
 
-SLOWEST = 64 << 10
+SLOWEST = 256 << 10
 """Bytes a second: a request may take a second more for as many bytes that it moves."""
 
 _PATIENCE = 10
@@ -35,6 +35,9 @@ _FIRST_PAUSE = 0.3
 
 _ABORT_SECONDS = 5.0
 """Most seconds to spend on dropping the parts of an upload that has failed."""
+
+_CONNECT_SECONDS = 60.0
+"""Seconds to load what botocore knows of S3, and to find credentials, besides what a request takes."""
 
 _VARIABLE = "GSPLAT_STORE_TIMEOUT"
 _EXTRAS = {"s3": "s3fs (pip install 'gsplat_tools[s3]')", "gs": "gcsfs (pip install 'gsplat_tools[gs]')"}
@@ -116,11 +119,16 @@ def file_system(url: str) -> tuple[Any, str]:
             kind, options = _gs(), {"requests_timeout": _gs_timeout(seconds)}
         else:
             return cast("tuple[Any, str]", fsspec.core.url_to_fs(url))
-        return kind(**options, **kind._get_kwargs_from_urls(url)), kind._strip_protocol(url)
+        system, path = kind(**options, **kind._get_kwargs_from_urls(url)), kind._strip_protocol(url)
     except ImportError as error:
         raise MissingDependencyError(f"{scheme}:// needs {_EXTRAS.get(scheme, 'its fsspec package')}: {error}") from error
     except ValueError as error:
         raise ReadError(f"no store is known for {scheme}://; {error}", path=url) from error
+    if hasattr(system, "call_s3"):
+        system.connect(
+            timeout=_CONNECT_SECONDS + seconds
+        )  # or loading what botocore knows of S3 counts as a store that is slow
+    return system, path
 
 
 @cache
