@@ -125,9 +125,8 @@ def file_system(url: str) -> tuple[Any, str]:
     except ValueError as error:
         raise ReadError(f"no store is known for {scheme}://; {error}", path=url) from error
     if hasattr(system, "call_s3"):
-        system.connect(
-            timeout=_CONNECT_SECONDS + seconds
-        )  # or loading what botocore knows of S3 counts as a store that is slow
+        # Or loading what botocore knows of S3 would count as a store that is slow.
+        system.connect(timeout=_CONNECT_SECONDS + seconds)
     return system, path
 
 
@@ -141,6 +140,8 @@ def _s3() -> Any:
 
         def call_s3(self, method: str, *arguments: Any, **named: Any) -> Any:
             """Make a request of an open file, which is what s3fs sends parts by."""
+            if method == "abort_multipart_upload":  # of older versions, which have no `abort_mpu`
+                return super().call_s3(method, *arguments, timeout=min(_ABORT_SECONDS, store_timeout()), **named)
             patience = _PATIENCE if method == "complete_multipart_upload" else 1
             size = len(named.get("Body") or b"")
             return _tried(super().call_s3, method, *arguments, seconds=_allowed(size, patience), **named)

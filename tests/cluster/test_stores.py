@@ -178,3 +178,27 @@ def test_a_store_that_stays_busy__is_an_error_that_names_it(store: Proxy, monkey
 
     with pytest.raises(ReadError, match=r"s3://bucket/a\.ply: cannot read from the store"):
         load("s3://bucket/a.ply")
+
+
+def test_an_object_that_is_replaced_while_it_is_read__is_an_error(store: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_stores, "BLOCK_BYTES", 1 << 19)
+    system = fsspec.filesystem("s3")
+    system.pipe_file(f"{BUCKET}/x", bytes(3 << 20))
+    with _stores.open_object("s3://bucket/x") as stream:
+        assert stream.read(1 << 18) == bytes(1 << 18)
+        system.pipe_file(f"{BUCKET}/x", bytes(reversed(range(256))) * (3 << 12))
+        with pytest.raises(ReadError, match=r"s3://bucket/x: the object was replaced"):
+            stream.read()
+
+
+def test_reads_here_and_there__give_the_bytes_that_are_there(memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_stores, "BLOCK_BYTES", 1000)
+    data = np.random.default_rng(1).bytes(400_000)
+    memory.pipe_file("/b/x", data)
+    with _stores.open_object("memory://b/x") as stream:
+        for start in (0, 390_000, 5, 263_000, 399_999, 400_000, 500_000, 17):
+            for size in (1, 999, 1001, 70_000):
+                assert stream.seek(start) == start
+                assert stream.read(size) == data[start : start + size]
+        assert stream.seek(-3, 2) == 399_997
+        assert stream.read() == data[-3:]
