@@ -183,11 +183,11 @@ def s3_server() -> Iterator[Proxy]:
     before = {name: os.environ.get(name) for name in own}
     os.environ.update(own)
     try:
-        _forget()
+        forget()
         fsspec.filesystem("s3").mkdir(BUCKET)
         yield proxy
     finally:
-        _forget()
+        forget()
         proxy.close()
         server.stop()
         for name, value in before.items():
@@ -197,7 +197,7 @@ def s3_server() -> Iterator[Proxy]:
                 os.environ[name] = value
 
 
-def _forget() -> None:
+def forget() -> None:
     """Let go of connections to an earlier server."""
     import fsspec
 

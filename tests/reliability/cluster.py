@@ -26,7 +26,7 @@ from gsplat_tools.cluster.sequences import convert_sequence
 from gsplat_tools.errors import GsplatError
 from gsplat_tools.formats._stores import exists, is_url
 from tests.cluster.sequences import killing, local_bundle, make_frames, parts_of, sha256
-from tests.cluster.stores import BUCKET, s3_server
+from tests.cluster.stores import BUCKET, forget, s3_server
 
 OPTIONS: dict[str, Any] = {"delta_segment_length": 8}
 
@@ -237,7 +237,7 @@ def on_s3(cases: Cases, folder: Path) -> None:
         target = f"s3://{BUCKET}/killed/out.sog4d"
         cases.case("S3, local-cluster:2, a worker killed", "local-cluster:2", pattern, target, kill(target))
         os.environ["AWS_ENDPOINT_URL"] = proxy.url
-        fsspec.get_filesystem_class("s3").clear_instance_cache()
+        forget()
         faults = {
             "every 20th request 503, every 33rd cut": lambda _m, _p, n: (
                 "503" if n % 20 == 9 else "cut" if n % 33 == 9 else None
