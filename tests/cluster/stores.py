@@ -162,6 +162,7 @@ class Proxy:
 def s3_server() -> Iterator[Proxy]:
     """An empty bucket, for this process and its children; yields the proxy that stands before it."""
     import fsspec
+    import requests
     from moto.server import ThreadedMotoServer
 
     logging.getLogger("werkzeug").setLevel(logging.CRITICAL)
@@ -184,6 +185,7 @@ def s3_server() -> Iterator[Proxy]:
     os.environ.update(own)
     try:
         forget()
+        requests.post(f"{proxy.direct}/moto-api/reset", timeout=10)  # servers of one process share what they hold
         fsspec.filesystem("s3").mkdir(BUCKET)
         yield proxy
     finally:
