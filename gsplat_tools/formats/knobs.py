@@ -64,8 +64,9 @@ SIZES = tuple(round(2 ** (step / 2)) for step in range(10, 31))
 """Entries of codebooks and palettes, 32 to 32,768, each sqrt(2) times the one before."""
 
 
-LIT_PIXELS = (*(round(1.25**step, 4) for step in range(24, -36, -1)), 0.0)
-"""Below which splats are left out, `prune_faint`, 212 to 0.0004: dense, as formats with few other knobs have no finer step."""
+LIT_PIXELS = (*(round(1.25**step, 4) for step in range(31, -36, -1)), 0.0)
+"""Below which splats are left out, `prune_faint`, 1,010 to 0.0004: dense, since formats with few other knobs have no finer
+step."""
 
 TOLERANCES = (0.3, 0.2, 0.14, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.0)
 """Pixels of `visual_tolerance`."""

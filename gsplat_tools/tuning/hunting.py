@@ -132,7 +132,24 @@ class Hunt:
                 best = choice, trial
                 if self._is_close(trial):
                     break
-        return best or self._extreme()
+        return self._refined(best or self._extreme(), advance)
+
+    def _refined(self, best: tuple[Choice, Trial], advance: Callable[[int], None]) -> tuple[Choice, Trial]:
+        """Return a choice with fewer splats and coarser codes that holds a PSNR too, where it had some dB to spare."""
+        for axis, stream in enumerate(self._rates.streams):
+            if self._budget.min_psnr is None or stream.name not in ("splats", "codes"):
+                continue
+            tried = stream.coarser(best[0].places[axis])
+            while tried and not self._is_close(best[1]):  # the coarsest that holds lies on one side of the middle
+                middle = len(tried) // 2
+                choice = self._rates.moved(best[0], axis, tried[middle])
+                trial = self._verify(choice)
+                advance(1)
+                holds = self._holds(trial) and self._is_better(trial, best[1])
+                if holds:
+                    best = choice, trial
+                tried = tried[:middle] if holds else tried[middle + 1 :]
+        return best
 
     def preset(self, best: Trial | None) -> tuple[dict[str, Any], Trial, str] | None:
         """Return the smallest preset that holds a PSNR in no more bytes than what was found, a step coarser where one holds.

@@ -230,11 +230,12 @@ class RateModel:
         smaller = [row for row in rows if sizes[row] < here]
         larger = [row for row in rows if sizes[row] > here]
         return (
-            self._moved(choice, axis, smaller[-1]) if smaller else None,
-            self._moved(choice, axis, larger[0]) if larger else None,
+            self.moved(choice, axis, smaller[-1]) if smaller else None,
+            self.moved(choice, axis, larger[0]) if larger else None,
         )
 
-    def _moved(self, choice: Choice, axis: int, place: int) -> Choice:
+    def moved(self, choice: Choice, axis: int, place: int) -> Choice:
+        """Return a choice with another option of one stream."""
         places = (*choice.places[:axis], place, *choice.places[axis + 1 :])
         table = self.table()
         sizes, factor, errors = float(self._fixed.bytes), 1.0, self._fixed.errors.copy()

@@ -66,6 +66,16 @@ class StreamModel:
         """Return the graded knobs that an option names."""
         return [name for name in self._graded if name in dict(self.options[index])]
 
+    def coarser(self, index: int) -> list[int]:
+        """Return the options whose graded knobs are coarser than those of an option, all else alike, the coarsest first."""
+        place, category = self._places[index], self._categories[index]
+        found = [
+            i
+            for i, (other, kind) in enumerate(zip(self._places, self._categories, strict=True))
+            if kind == category and other != place and all(a <= b for a, b in zip(other, place, strict=True))
+        ]
+        return sorted(found, key=lambda i: self._places[i])
+
     def first_choices(self) -> list[Option]:
         """Return the options that are measured before anything is predicted."""
         chosen: list[Option] = []

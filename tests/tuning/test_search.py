@@ -145,5 +145,18 @@ def test_preset__is_taken_a_step_coarser_where_the_search_finds_nothing_smaller(
     assert found.decisions[0]["stream"].startswith("preset")
 
 
+def test_search__makes_splats_coarser_where_predictions_leave_dB_to_spare(scene: GaussianCloud, monkeypatch) -> None:
+    small = scene.replace(log_scales=scene.log_scales - np.float32(1.5))
+    searcher = Searcher(small, find_format("splat"), **SMALL)
+    finest = searcher.whole.encode({"rotation": "best"})
+    monkeypatch.setattr("gsplat_tools.tuning.hunting.Hunt._propose", lambda hunt, _margin: hunt._rates.settle())
+    monkeypatch.setattr("gsplat_tools.tuning.hunting.Hunt.preset", lambda *_: None)
+
+    found = searcher.find(Budget(min_psnr=finest.level - 3))
+
+    assert finest.level - 3 <= found.psnr_min < finest.level
+    assert found.bytes < finest.bytes
+
+
 def _fail(*_: object) -> None:
     raise ValidationError("nothing")
