@@ -160,9 +160,9 @@ def convert_sequence(
         shared_here: Shared = next(iter(stages.run("collect", "fetching codebooks", [shared], [0])))
         num_splats = int(np.count_nonzero(kept.keeps))
         entries = last_entries(shared_here, num_splats, job.segments, times, facts, uses_deltas=job.uses_deltas)
-        start = time.perf_counter()
+        assembling = time.perf_counter()
         size, digest = assemble(target, found, entries, shared_here, overwrite=overwrite)
-        stages.note("assemble", seconds=time.perf_counter() - start, bytes=size)
+        stages.note("assemble", seconds=time.perf_counter() - assembling, bytes=size)
         if not is_url(target):
             check_published(target, num_splats, len(files), shared_here.bands)
         remove_parts(folder)
