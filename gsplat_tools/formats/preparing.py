@@ -163,7 +163,7 @@ def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
     if choices.outliers == "drop":
         scene, num_outliers = _without_outliers(scene, choices)
     chunks = as_chunks(scene, max(len(scene), 1)) if in_one else as_chunks(scene)
-    scan = _scan(chunks, choices)
+    scan = scan_chunks(chunks, choices)
     if num_outliers:
         scan.dropped["outliers"] += num_outliers
     fit = Fit(chunks.template, target, choices, scan)
@@ -196,8 +196,14 @@ def _without_outliers(scene: GaussianCloud | CloudChunks, choices: SaveChoices) 
     return cloud.take(stays), len(outliers)
 
 
-def _scan(chunks: CloudChunks, choices: SaveChoices) -> Scan:
-    """Go through the scene once: invalid splats, bounds, highest band in use."""
+def scan_chunks(chunks: CloudChunks, choices: SaveChoices) -> Scan:
+    """Go through the scene once: invalid splats, bounds, highest band in use.
+
+    Raises
+    ------
+    CloudError
+        `strict` and there are invalid splats.
+    """
     scan = Scan()
     with stage("reading", len(chunks)) as progress:
         for chunk in chunks:
@@ -283,6 +289,14 @@ class Fit:
         if not self._target.stores_origin and chunk.origin.any():
             chunk = chunk.replace(origin=np.zeros(3))  # given up with a warning: what is written starts from here
         return chunk
+
+    def box(self, template: GaussianCloud, scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the ends of the positions as they will be written, (3,) each.
+
+        Axes trade places and change their signs, and shifts are rounded, which keeps the order: corners stay corners.
+        """
+        corners = self.apply(template.replace(**_corner_arrays(scan.low, scan.high, template)))
+        return corners.means.min(axis=0), corners.means.max(axis=0)
 
     def _turn(self, cloud: GaussianCloud) -> GaussianCloud:
         """Name the source's axes and convert them."""

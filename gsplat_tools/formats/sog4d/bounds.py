@@ -13,6 +13,7 @@ from gsplat_tools.codecs.rotation_bounds import covariance_bound_of_ranges
 from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog4d.bundle import Bundle
 from gsplat_tools.formats.sog4d.meta import frame_path
+from gsplat_tools.formats.sog4d.piece import Piece
 from gsplat_tools.formats.sog4d.textures import indices_of, pixels_of
 from gsplat_tools.ops.visibility import MAX_TURN, MOST, allowed_error
 
@@ -52,9 +53,13 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
     FormatError
         The bundle cannot be read.
     """
+    return bounds_in(Bundle(stream), source, frame)
+
+
+def bounds_in(bundle: Bundle | Piece, source: GaussianCloud, frame: int) -> Bounds:
+    """Return the largest errors of one frame of an opened bundle; see `bounds`."""
     from gsplat_tools.codecs.scalar_codebook import nearest_entry
 
-    bundle = Bundle(stream)
     meta = bundle.meta
     low, high = meta.range_min[frame].astype(np.float64), meta.range_max[frame].astype(np.float64)
     means = (high - low) / 65535 / 2 + np.maximum(np.abs(low), np.abs(high)) * _ROUNDING
