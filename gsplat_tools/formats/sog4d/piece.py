@@ -13,10 +13,18 @@ from gsplat_tools.formats._issues import raise_errors
 from gsplat_tools.formats._webp import Image
 from gsplat_tools.formats.sog4d.bundle import centroids_of
 from gsplat_tools.formats.sog4d.labels import Labels
-from gsplat_tools.formats.sog4d.meta import PaletteMeta
+from gsplat_tools.formats.sog4d.meta import Meta, PaletteMeta
 from gsplat_tools.formats.sog4d.meta_reader import parse_meta
 from gsplat_tools.formats.sog4d.rules import RULES
 from gsplat_tools.formats.sog4d.textures import indices_of, rgba_image
+
+
+def meta_in(entries: Mapping[str, bytes]) -> Meta:
+    """Return what meta.json will say to readers."""
+    meta, issues = parse_meta(entries["meta.json"])
+    raise_errors(issues, RULES)
+    assert meta is not None
+    return meta
 
 
 class Piece:
@@ -24,16 +32,15 @@ class Piece:
 
     Parameters
     ----------
+    meta
+        What `meta_in` returns for the entries.
     entries
         meta.json and the palettes as they will stand in the archive.
     columns
         `FramePlanes.columns` of the splats.
     """
 
-    def __init__(self, entries: Mapping[str, bytes], columns: Mapping[str, NDArray[np.uint8]]) -> None:
-        meta, issues = parse_meta(entries["meta.json"])
-        raise_errors(issues, RULES)
-        assert meta is not None
+    def __init__(self, meta: Meta, entries: Mapping[str, bytes], columns: Mapping[str, NDArray[np.uint8]]) -> None:
         count = len(columns["rotation"])
         self.meta = replace(meta, splat_count=count, width=count, height=1)
         self._entries, self._columns = entries, columns
