@@ -14,7 +14,7 @@ from gsplat_tools.attributes.quaternions import to_matrix
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
 from gsplat_tools.formats.sog4d import Sog4dOptions, Sog4dReadOptions, read, write
-from gsplat_tools.formats.sog4d.bounds import rotation_bound
+from gsplat_tools.formats.sog4d.bounds import rotation_bound, scale_reach
 from gsplat_tools.formats.sog4d.codebooks import falling_frames, scale_coordinates, scales_at, turned
 from gsplat_tools.formats.sog4d.frame import constant_w_bytes
 from gsplat_tools.parallel import use_jobs
@@ -265,3 +265,20 @@ def test_refusals__say_why() -> None:
 def test_options__are_checked(options: Any) -> None:
     with pytest.raises(CapabilityError, match=next(iter(options))):
         Sog4dOptions(**options)
+
+
+def test_scales_halfway_between_two_entries__keep_their_bound() -> None:
+    from gsplat_tools.codecs.palette import nearest_labels
+    from gsplat_tools.formats.sog4d.codebooks import points_of, scale_coordinates, scales_at
+
+    rng = np.random.default_rng(0)
+    codebook = -np.sort(-np.exp(rng.uniform(-7, -1, (400, 3))), axis=1).astype(np.float32)
+    pairs = points_of(codebook)[rng.integers(0, len(codebook), (2, 100_000))].astype(np.float64)
+    log_scales = np.log(scales_at(pairs.mean(axis=0).astype(np.float32)))
+    labels = nearest_labels(scale_coordinates(log_scales), points_of(codebook))[0]
+    axes = np.tile(np.arange(3), (len(labels), 1))
+
+    least, largest = scale_reach(log_scales, codebook, labels, axes, is_first=True)
+
+    stored = np.log(codebook.astype(np.float64))[labels]
+    assert ((least <= stored) & (stored <= largest)).all()

@@ -165,11 +165,11 @@ def scale_reach(
     distance that a visual tolerance allows beyond the nearest entry.
     """
     from gsplat_tools.codecs.palette import nearest_labels
-    from gsplat_tools.formats.sog4d.codebooks import MIN_LOG, THIN, scale_coordinates
+    from gsplat_tools.formats.sog4d.codebooks import MIN_LOG, THIN, points_of, scale_coordinates
 
     with np.errstate(divide="ignore"):
         logs_of_entries = np.log(codebook.astype(np.float64))
-    entries = scale_coordinates(logs_of_entries.astype(np.float32))
+    entries = points_of(codebook)
     points = scale_coordinates(np.take_along_axis(log_scales, axes, axis=1))
     nearest, squares = nearest_labels(points, entries)
     least = largest = logs_of_entries[nearest]

@@ -101,8 +101,7 @@ class Shared:
     scale_points: Float32 = field(init=False)
 
     def __post_init__(self) -> None:
-        with np.errstate(divide="ignore"):
-            object.__setattr__(self, "scale_points", scale_coordinates(np.log(self.scale_codebook)))
+        object.__setattr__(self, "scale_points", points_of(self.scale_codebook))
 
 
 @dataclass(slots=True)
@@ -168,6 +167,12 @@ def scale_coordinates(log_scales: Float32) -> Float32:
     largest = wide.max(axis=-1, keepdims=True)
     coordinates: Float32 = np.maximum(largest + np.log(np.exp(wide - largest) + THIN), MIN_LOG).astype(np.float32)
     return coordinates
+
+
+def points_of(scale_codebook: Float32) -> Float32:
+    """Return the coordinates of stored entries, in which labels are chosen and, with the same bits, bounds derived."""
+    with np.errstate(divide="ignore"):
+        return scale_coordinates(np.log(scale_codebook))
 
 
 def scales_at(coordinates: Float32) -> Float32:
@@ -294,8 +299,7 @@ def _balanced_scale_size(codebook: Float32, cloud: GaussianCloud, log_scales: Fl
     """
     from gsplat_tools.codecs.palette import nearest_labels
 
-    with np.errstate(divide="ignore"):
-        entries = scale_coordinates(np.log(codebook))
+    entries = points_of(codebook)
     _, squares = nearest_labels(scale_coordinates(log_scales), entries)
     shown = float(np.minimum(tolerance.costs(cloud, log_scales).scale * squares, MOST).sum())
     # The root of a K^2 + b K = shown x size: the derivatives balance.
@@ -314,9 +318,7 @@ def _fit_scales(sample: Sample, options: Sog4dOptions, size: int) -> tuple[Float
     centroids = fit_palette(points, np.sqrt(sample.weights), size=size, max_rounds=2)
     error = float(nearest_labels(points, centroids)[1].mean(dtype=np.float64))
     codebook = _on_grid(scales_at(centroids), _SCALE_GRID * np.sqrt(error / 3))
-    with np.errstate(divide="ignore"):
-        stored = scale_coordinates(np.log(codebook))
-    return codebook, float(nearest_labels(points, stored)[1].mean(dtype=np.float64))
+    return codebook, float(nearest_labels(points, points_of(codebook))[1].mean(dtype=np.float64))
 
 
 def _on_grid(codebook: Float32, step: float) -> Float32:
