@@ -22,6 +22,7 @@ from gsplat_tools.convert import unique_warnings
 from gsplat_tools.errors import CapabilityError, GsplatWarning, ReadError, TargetExistsError
 from gsplat_tools.formats._limits import max_memory
 from gsplat_tools.formats._stores import exists, identity, is_url, local_path, url_of
+from gsplat_tools.formats.base import FileInfo, Format
 from gsplat_tools.formats.loading import inspect_file
 from gsplat_tools.formats.preparing import SaveChoices
 from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, split_options
@@ -38,20 +39,11 @@ DEFAULT_BLOCK_SPLATS = 1 << 20
 """Splats of a block: 250 MB of rows at SH degree 3."""
 
 
-def why_whole(source: str | Path, preset: str = DEFAULT_PRESET, **options: Any) -> str | None:
-    """Return why a conversion of one file to .sog4d needs the whole scene in memory; None where blocks will do."""
-    path = Path(local_path(source))
-    if not is_url(path) and path.is_fifo():
-        return "a pipe can be read once"
-    record, _ = inspect_file(path)
-    if record.read_chunks is None:
-        return f"{record.title} is read whole"
-    if "frame_times" in options:
-        return "times are chosen from the whole scene"
-    choices, written = split_options(tasks.FORMAT, preset, options)
-    if written.visual_tolerance > 0:
-        return "a visual tolerance weighs the images of the whole scene"
-    return "outliers are told from all splats" if choices.outliers == "drop" else None
+class WholeSceneError(CapabilityError):
+    """A conversion needs the whole scene in memory, and cannot be done in blocks."""
+
+    def __init__(self, reason: str, path: Path | None = None) -> None:
+        super().__init__(f"this conversion cannot be done in blocks: {reason}; leave out --block-splats", path=path)
 
 
 def convert_blocks(
@@ -103,8 +95,8 @@ def convert_blocks(
     ------
     GsplatError
         As `convert`.
-    CapabilityError
-        The whole scene is needed; see `why_whole`.
+    WholeSceneError
+        The source is not read in chunks, or options look at all splats at once: outliers, a visual tolerance, times.
     ClusterError
         Workers or the connection to them were lost for good; the same call continues.
     """
@@ -117,12 +109,9 @@ def convert_blocks(
         raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=target)
     if block_splats < 1:
         raise CapabilityError(f"a block needs at least one splat, got {block_splats}")
-    reason = why_whole(source, preset, **options)
     path = Path(local_path(source))
-    if reason is not None:
-        raise CapabilityError(f"this conversion cannot be done in blocks: {reason}; leave out --block-splats", path=path)
     choices, write_options = split_options(record, preset, options)
-    source_record, first = inspect_file(path)
+    source_record, first = _inspected(path, choices, write_options)
     name = url_of(path) if is_url(path) else str(path.absolute())
     stages = Stages(engine)
     with warnings.catch_warnings(record=True) as caught:
@@ -194,6 +183,22 @@ def convert_blocks(
             "stages": stages.spent,
         },
     )
+
+
+def _inspected(path: Path, choices: SaveChoices, options: Sog4dOptions) -> tuple[Format, FileInfo]:
+    """Return what the header of the source says, if blocks will do."""
+    if not is_url(path) and path.is_fifo():
+        raise WholeSceneError("a pipe can be read once", path)
+    record, info = inspect_file(path)
+    if record.read_chunks is None:
+        raise WholeSceneError(f"{record.title} is read whole", path)
+    if options.frame_times is not None:
+        raise WholeSceneError("times may bake the motion of the whole scene", path)
+    if options.visual_tolerance > 0:
+        raise WholeSceneError("a visual tolerance weighs the images of the whole scene", path)
+    if choices.outliers == "drop":
+        raise WholeSceneError("outliers are told from all splats", path)
+    return record, info
 
 
 class _Job:
