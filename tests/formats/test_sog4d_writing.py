@@ -282,3 +282,25 @@ def test_scales_halfway_between_two_entries__keep_their_bound() -> None:
 
     stored = np.log(codebook.astype(np.float64))[labels]
     assert ((least <= stored) & (stored <= largest)).all()
+
+
+def test_zeros_of_both_signs__give_one_range() -> None:
+    cloud = random_cloud(50, sh_degree=0)
+    means = np.abs(cloud.means)
+    means[:, 1] = 0
+    texts = []
+    for sign in (1, -1):
+        means[:25, 1] *= np.float32(sign)
+        texts.append(written(cloud.replace(means=means.copy())))
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize(
+    "values", [[0.0] * 100, list(range(100)), [5.0, 1.0, 5.0, 5.0, 2.0] * 30, [-np.inf] * 60 + [1.0]]
+)
+def test_long_splats__are_the_first_of_the_longest(values: list[float]) -> None:
+    from gsplat_tools.formats.sog4d.codebooks import LONG_SHARE, longest
+
+    lengths = np.array(values)
+    order = np.argsort(-lengths, kind="stable")[: int(np.ceil(LONG_SHARE * len(lengths)))]
+    assert np.flatnonzero(longest(lengths)).tolist() == sorted(order)
