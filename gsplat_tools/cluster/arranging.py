@@ -245,6 +245,7 @@ def arrange(
         }
         template = fitted.template
         digests = _write_rows(rows, fitted, order, block_splats, draws)
+    starts = np.cumsum([0, *(draw.rows.nbytes for draw in draws.values())])
     said = Arrangement(
         path=path,
         rows=rows,
@@ -253,16 +254,15 @@ def arrange(
         sh_degree=fitted.sh_degree,
         block_splats=block_splats,
         digests=digests,
-        drawn={},
+        drawn={name: (int(start), len(draw.rows)) for start, (name, draw) in zip(starts, draws.items(), strict=False)},
         low=order.ends[0].tolist(),
         high=order.ends[1].tolist(),
         sh0_range=order.sh0_range,
         top_weight=order.top_weight,
         facts={name: getattr(template, name) for name in ("coordinate_system", "splat_model", "source_format")},
     )
-    with sealed(path, asdict(said) | {"drawn": said.drawn}) as body:
-        for name, draw in draws.items():
-            said.drawn[name] = (body.size, len(draw.rows))
+    with sealed(path, asdict(said)) as body:
+        for draw in draws.values():
             body.write(draw.rows.view(np.uint8).data)
     return said
 

@@ -122,17 +122,23 @@ def encode_block(arrangement: Arrangement, shared: Shared, index: int, path: str
     own_shared = for_splats(shared, cloud, is_long if shared.options.rotation == "small" else None)
     planes = encode_frame(cloud, own_shared, ends=arrangement.ends)
     encoded = time.perf_counter()
-    part = CodePart(path=path, key=key, count=len(cloud), clipped=planes.clipped)
-    if is_checked:
-        part.tally = _checked(cloud, planes.columns, entries_of(arrangement, shared))
+    tally = _checked(cloud, planes.columns, entries_of(arrangement, shared)) if is_checked else None
     checked = time.perf_counter()
-    part.seconds = {"read": read - start, "encode": encoded - read, "validate": checked - encoded}
-    said = {**asdict(part), "tally": tally_to_json(part.tally), "columns": part.columns}
-    with temporary_data(), sealed(path, said) as body:
-        for name, column in planes.columns.items():
-            data = np.ascontiguousarray(column).reshape(-1)
-            part.columns[name] = (body.size, column.shape[1], checksum(data.data))
-            body.write(data.data)
+    part = CodePart(
+        path=path,
+        key=key,
+        count=len(cloud),
+        clipped=planes.clipped,
+        tally=tally,
+        seconds={"read": read - start, "encode": encoded - read, "validate": checked - encoded},
+    )
+    offset = 0
+    for name, column in planes.columns.items():
+        part.columns[name] = (offset, column.shape[1], checksum(column.reshape(-1).data))
+        offset += column.size
+    with temporary_data(), sealed(path, {**asdict(part), "tally": tally_to_json(tally)}) as body:
+        for column in planes.columns.values():
+            body.write(column.reshape(-1).data)
     part.seconds["write"] = time.perf_counter() - checked
     return part
 

@@ -231,8 +231,6 @@ class _Job:
                 "block_splats": self.block_splats,
             }
         )
-        if not is_url(self.folder):
-            Path(self.folder).mkdir(parents=True, exist_ok=True)
         submit, count = self.stages.engine.submit, self.source.first.splats
         looking = submit(look_at_scene, self.source, self.choices)
         look: Look = self._only("look", "reading", looking, count)
@@ -241,6 +239,8 @@ class _Job:
                 f"{tasks.FORMAT.title} holds at least {tasks.FORMAT.min_splats} splat, and none is left to write"
             )
         self.layout = choose_layout(look.scan.num_kept, self.options)
+        if not is_url(self.folder):
+            Path(self.folder).mkdir(parents=True, exist_ok=True)
         key = self._own("scene")
         arranging = submit(arrange, self.source, looking, self.choices, self.options, self.folder, key, self.block_splats)
         arrangement: Arrangement = self._only("arrange", "arranging", arranging, look.scan.num_kept)

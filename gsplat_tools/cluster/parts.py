@@ -63,7 +63,7 @@ class Hashed:
 
 @contextmanager
 def sealed(path: str, said: dict[str, Any]) -> Iterator[Hashed]:
-    """Open a part that appears, whole, when the block ends; it ends with `said`, to which the block may add."""
+    """Open a part that appears, whole, when the block ends; it says `said` about itself."""
     opened = replacing_object(path, overwrite=True) if is_url(path) else replacing(Path(path), overwrite=True)
     with opened as stream:
         body = Hashed(stream)

@@ -295,9 +295,7 @@ def test_zeros_of_both_signs__give_one_range() -> None:
     assert texts[0] == texts[1]
 
 
-@pytest.mark.parametrize(
-    "values", [[0.0] * 100, list(range(100)), [5.0, 1.0, 5.0, 5.0, 2.0] * 30, [-np.inf] * 60 + [1.0]]
-)
+@pytest.mark.parametrize("values", [[0.0] * 100, list(range(100)), [5.0, 1.0, 5.0, 5.0, 2.0] * 30, [-np.inf] * 60 + [1.0]])
 def test_long_splats__are_the_first_of_the_longest(values: list[float]) -> None:
     from gsplat_tools.formats.sog4d.codebooks import LONG_SHARE, longest
 
