@@ -1,6 +1,6 @@
 """A still scene in blocks: where every splat stands in the bundle, and rows on the disk that can be taken block by block.
 
-The scene is gone through chunk by chunk. In memory stay some thirty bytes a splat while the order is found (its cell in
+The scene is gone through chunk by chunk. In memory stay some 35 bytes a splat while the order is found (its cell in
 space, and what global thresholds need), five while rows are written, and a few hundred thousand splats that are drawn.
 A block is a run of the order, which for a Morton order is a piece of space.
 """
@@ -244,7 +244,7 @@ def arrange(
             "pictures": _Draw(np.arange(0, count, step), dtype),
         }
         template = fitted.template
-        digests = _write_rows(rows, fitted, order, block_splats, draws)
+        digests = _write_rows(rows, fitted, order, block_splats, draws, source)
     starts = np.cumsum([0, *(draw.rows.nbytes for draw in draws.values())])
     said = Arrangement(
         path=path,
@@ -336,17 +336,17 @@ class _Draw:
         self.rows[places[is_wanted]] = rows[is_wanted]
 
 
-def _write_rows(path: str, fitted: CloudChunks, order: _Order, block_splats: int, draws: dict[str, _Draw]) -> list[str]:
+def _write_rows(
+    path: str, fitted: CloudChunks, order: _Order, block_splats: int, draws: dict[str, _Draw], source: FrameSource
+) -> list[str]:
     """Write every row to its block, in the order in which they come, and return the SHA-256 of every block."""
     dtype = row_type(fitted.sh_degree)
     num_blocks = -(-len(fitted) // block_splats)
     digests = [hashlib.sha256() for _ in range(num_blocks)]
     filled = np.arange(num_blocks, dtype=np.int64) * block_splats
-    start = 0
     with _opened(path) as stream:
-        for chunk in fitted:
+        for start, chunk in _placed(fitted, source):
             ranks = order.ranks[start : start + len(chunk)]
-            start += len(chunk)
             rows = np.empty(len(chunk), dtype)
             rows["place"], rows["is_long"] = ranks % block_splats, order.is_long[ranks]
             for name in _attributes(dtype):

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from gsplat_tools.cloud import empty_cloud
 from gsplat_tools.cluster import block_tasks, tasks
 from gsplat_tools.cluster.arranging import Arrangement, Look, arrange, look_at_scene
 from gsplat_tools.cluster.assembling import assemble, check_published, folder_of_parts, remove_parts
@@ -140,7 +141,7 @@ def convert_blocks(
         facts = block_tasks.facts_of(arrangement, [block.clipped for block in blocks])
         warn_clipped([facts])
         uses_deltas = has_deltas(1, write_options)
-        times = choose_times(arrangement.cloud(arrangement.drawn_rows("pilot")), 1, write_options)
+        times = choose_times(empty_cloud(0, 0), 1, write_options)  # of a still scene, whichever
         entries = last_entries(shared, arrangement.num_splats, [(0, 1)], times, [facts], uses_deltas=uses_deltas)
         for palette in shared.palettes if uses_deltas else ():
             entries[delta_path(palette.name, 0)] = label_files.write_delta(

@@ -16,14 +16,14 @@ from gsplat_tools.cli.convert import main
 from gsplat_tools.cluster import block_tasks, blocks
 from gsplat_tools.cluster.arranging import _Draw, row_type
 from gsplat_tools.cluster.blocks import WholeSceneError, convert_blocks
-from gsplat_tools.cluster.engines import InProcess, Processes, open_engine
+from gsplat_tools.cluster.engines import InProcess, open_engine
 from gsplat_tools.convert import ConversionReport, convert
 from gsplat_tools.errors import CapabilityError, CloudError, ClusterError, ReadError, ValidationError, WriteError
 from gsplat_tools.formats.saving import save
 from gsplat_tools.parallel import BLOCK_SIZE
 from gsplat_tools.verification import Validation
 from tests.clouds import random_cloud
-from tests.cluster.sequences import killing, parts_of, sha256
+from tests.cluster.sequences import killing, parts_of, pids, sha256
 from tests.cluster.test_sequences import save_raw
 
 pytestmark = pytest.mark.cluster
@@ -185,20 +185,26 @@ def test_what_is_not_right__leaves_the_target_as_it_was(scenes: Path, tmp_path: 
     assert target.read_bytes() == b"before"
 
 
-def test_a_killed_process__changes_no_byte(scenes: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("scheduler", "during"), [("local:2", "arrange"), ("local:2", "encode"), ("local-cluster:1", "encode")]
+)
+def test_a_killed_worker__changes_no_byte(scenes: Path, tmp_path: Path, scheduler: str, during: str) -> None:
+    if scheduler.startswith("local-cluster"):
+        pytest.importorskip("distributed")
     target = tmp_path / "out.sog4d"
+    folder = tmp_path / ".out.sog4d.gsplat-parts"
     expected, _ = local(scenes / "3.ply", tmp_path / "local.sog4d", **QUICK)
-    engine = Processes(2)
+    engine = open_engine(scheduler)
     try:
-        with killing(engine, lambda: bool(finished_blocks(target))) as killed:
-            report = convert_blocks(scenes / "3.ply", target, engine, block_splats=1, **QUICK)  # type: ignore[arg-type]
+        with killing(engine, lambda: bool(finished_blocks(target)) if during == "encode" else folder.exists()) as killed:
+            convert_blocks(scenes / "3.ply", target, engine, block_splats=1, **QUICK)  # type: ignore[arg-type]
+        assert pids(engine) != killed
     finally:
         engine.close()
 
     assert len(killed) == 1
     assert sha256(target.read_bytes()) == expected
-    assert report.cluster["retried"] >= 1
-    assert not parts_of(target)
+    assert not folder.exists()
 
 
 def finished_blocks(target: Path) -> list[Path]:
