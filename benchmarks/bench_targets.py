@@ -19,6 +19,7 @@ from machine import describe_machine
 import gsplat_tools
 from gsplat_tools.errors import GsplatError, ValidationError
 from gsplat_tools.formats.registry import find_format
+from gsplat_tools.formats.saving import DEFAULT_PRESET
 from gsplat_tools.remembering import remembering
 from gsplat_tools.tuning.search import Budget, Searcher
 
@@ -32,7 +33,7 @@ def measure_presets(searcher: Searcher, names: list[str], wanted: float) -> tupl
     """
     reaching: list[tuple[int, str, float]] = []
     for name in names:
-        changes = searcher.whole.record.presets.get(name)
+        changes = (searcher.whole.record.presets or {DEFAULT_PRESET: {}}).get(name)
         if changes is None or (reaching and searcher.is_large and name == "best"):
             continue
         trial = searcher.whole.encode(changes)

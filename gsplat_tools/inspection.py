@@ -170,7 +170,7 @@ def hints(cloud: GaussianCloud) -> list[Hint]:
     hidden = int(np.count_nonzero(activations.sigmoid(cloud.opacity_logits) < VISIBLE_OPACITY))
     if hidden:
         found.append(Hint("invisible", f"{hidden} splats have an opacity below 1/255: --prune-opacity 0.0039 drops them"))
-    if cloud.sh_degree and not cloud.shN.any():
+    if cloud.sh_degree and not (cloud.shN != 0).any():
         found.append(Hint("sh-all-zero", f"SH bands 1 to {cloud.sh_degree} are zero everywhere: --sh-degree auto drops them"))
     found += _float16_hint(cloud) + _overdraw_hint(cloud)
     return found

@@ -1,9 +1,10 @@
-"""Write the tables of the documents that follow from the code: the formats in README.md."""
+"""Write the tables of the documents that follow from the code: formats in README.md, presets and knobs in docs/tuning.md."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from gsplat_tools.cli._tuning import knob_table
 from gsplat_tools.formats.registry import FORMATS
 
 ROOT = Path(__file__).parents[1]
@@ -33,9 +34,15 @@ def with_table(text: str, name: str, table: str) -> str:
     return f"{before}{start}{table}\n{stop}{rest.split(stop)[1]}"
 
 
+def documents() -> dict[Path, str]:
+    """Return what the documents should say, by path."""
+    tables = {ROOT / "README.md": ("formats", formats_table()), ROOT / "docs" / "tuning.md": ("knobs", knob_table())}
+    return {path: with_table(path.read_text(encoding="utf-8"), *table) for path, table in tables.items()}
+
+
 def main() -> None:
-    readme = ROOT / "README.md"
-    readme.write_text(with_table(readme.read_text(encoding="utf-8"), "formats", formats_table()), encoding="utf-8")
+    for path, text in documents().items():
+        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,8 @@ SECTIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Target", ("formats", "preset", "overwrite", "dry_run")),
     ("Budget", ("target_psnr", "max_bytes", "max_bytes_per_splat", "auto", "own_visual_tolerance", "show_knobs")),
     ("Splats", (
-        "sh_degree", "prune_opacity", "outliers", "order", "source_coordinates", "target_coordinates", "recenter", "strict",
+        "sh_degree", "prune_opacity", "prune_faint", "outliers", "order", "source_coordinates", "target_coordinates",
+        "recenter", "strict",
     )),
     ("Sequences and motion", (
         "frame_times", "time_at", "frame", "interpolation", "frames", "tolerance", "fit_motion", "fit_report",

@@ -120,6 +120,13 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 )
 @click.option("--prune-opacity", type=options.FiniteType(0, 1), help="Drop splats of lower opacity; 0 prunes nothing.")
 @click.option(
+    "--prune-faint",
+    type=options.FiniteType(0),
+    metavar="PX",
+    help="Drop splats that can light fewer pixels (opacity squared times area), in a picture that the scene spans with 1,000 "
+    "px; 0 prunes nothing. By default what a visual tolerance is worth.",
+)
+@click.option(
     "--outliers",
     type=click.Choice(["auto", "keep", "drop"]),
     help="Far splats that hardly show and stretch the box; auto drops them with a visual tolerance.",

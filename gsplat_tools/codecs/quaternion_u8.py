@@ -108,6 +108,32 @@ def encode_with_frames(
     return codes, np.take_along_axis(scales, axes, axis=1)
 
 
+def encode_constant_w(quats: NDArray[np.float32], steps: int) -> NDArray[np.uint8]:
+    """Quantize rotations with w as the same number of steps everywhere, so that one byte of four says nothing.
+
+    Parameters
+    ----------
+    quats
+        (N, 4) wxyz, finite, of any length; length 0 is taken as the identity. Where w is not the largest component, the
+        quaternion is shortened until all fit.
+    steps
+        1 to 127; the error is at most 2 asin(sqrt(3) / 2 / steps) radians where w is the largest component.
+
+    Returns
+    -------
+    NDArray[np.uint8]
+        (N, 4) codes w x y z.
+    """
+    wide = quats.astype(np.float64)
+    wide *= np.where(wide[:, :1] < 0, -1.0, 1.0)
+    largest = np.abs(wide).max(axis=1, keepdims=True)
+    is_null = largest == 0
+    wide[is_null[:, 0]] = (1, 0, 0, 0)
+    # 127 steps for the largest component are the end of the byte.
+    scale = np.minimum(steps / np.maximum(wide[:, :1], 1e-30), 127 / np.where(is_null, 1.0, largest))
+    return (np.rint(wide * scale) + 128).astype(np.uint8)
+
+
 def _checked(quats: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     """Return quaternions as the kernels take them."""
     values = np.ascontiguousarray(quats, np.float32)

@@ -64,12 +64,8 @@ SIZES = tuple(round(2 ** (step / 2)) for step in range(10, 31))
 """Entries of codebooks and palettes, 32 to 32,768, each sqrt(2) times the one before."""
 
 
-OPACITIES = (
-    *(0.5, 0.45, 0.4, 0.35, 0.3, 0.27, 0.24, 0.22, 0.2, 0.185, 0.17, 0.155, 0.14, 0.13, 0.12, 0.11, 0.1, 0.092, 0.085, 0.078),
-    *(0.072, 0.066, 0.06, 0.055, 0.05, 0.046, 0.042, 0.038, 0.034, 0.03, 0.026, 0.022, 0.018, 0.014, 0.01),
-    *(INVISIBLE_OPACITY, 0.0),
-)
-"""Below which splats are left out, `prune_opacity`: dense, since formats with few other knobs have no finer step."""
+LIT_PIXELS = (*(round(1.25**step, 4) for step in range(24, -36, -1)), 0.0)
+"""Below which splats are left out, `prune_faint`, 212 to 0.0004: dense, as formats with few other knobs have no finer step."""
 
 TOLERANCES = (0.3, 0.2, 0.14, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.0)
 """Pixels of `visual_tolerance`."""
@@ -78,6 +74,7 @@ TOLERANCES = (0.3, 0.2, 0.14, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.0)
 def general_knobs(max_sh_degree: int = MAX_SH_DEGREE) -> dict[str, Knob]:
     """Return the knobs of every format: SH bands, and the opacity below which splats are left out."""
     return {
-        "prune_opacity": Knob(values=OPACITIES, stream="splats", graded=True),
+        "prune_opacity": Knob(values=(INVISIBLE_OPACITY, 0.0), stream="splats"),
+        "prune_faint": Knob(values=LIT_PIXELS, stream="splats", graded=True),
         "sh_degree": Knob(values=tuple(range(max_sh_degree + 1)), stream="sh"),
     }

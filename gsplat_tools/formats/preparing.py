@@ -20,6 +20,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, GsplatWarning, LossyConversionWarning, counts_in_words
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import warn_dropped
+from gsplat_tools.ops.visibility import Viewpoint, viewpoint_of
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
 
@@ -38,6 +39,9 @@ class SaveChoices:
         where the target is lossless.
     prune_opacity
         Splats with a lower opacity are dropped; 0 prunes nothing.
+    prune_faint
+        Splats that light fewer pixels (`ops.visibility.lit_pixels`) are dropped; 0 prunes nothing. By default what a visual
+        tolerance is worth, else 0.
     outliers
         "drop" leaves out far splats that hardly show where they stretch the box (`ops.outliers`), of still scenes; "auto"
         does so with a visual tolerance.
@@ -55,6 +59,7 @@ class SaveChoices:
 
     sh_degree: int | Literal["auto"] | None = None
     prune_opacity: float = 0.0
+    prune_faint: float | None = None
     outliers: Literal["auto", "keep", "drop"] = "auto"
     order: Literal["morton", "hilbert2d", "none"] | None = None
     source_coordinates: str | None = None
@@ -78,6 +83,8 @@ class SaveChoices:
                 raise CapabilityError(f"{name} must be axis letters such as RUB, RDF, RUF or LUF, got {axes!r}")
         if not 0 <= self.prune_opacity <= 1:
             raise CapabilityError(f"prune_opacity must be 0 to 1, got {self.prune_opacity}")
+        if self.prune_faint is not None and not 0 <= self.prune_faint < np.inf:
+            raise CapabilityError(f"prune_faint must be a number of pixels, 0 or more, got {self.prune_faint}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +105,8 @@ class Scan:
     low: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))
     sh_degree: int = 0
+    view: Viewpoint | None = None
+    """From where splats are looked at that are dropped for being faint."""
 
     def add(self, cloud: GaussianCloud) -> None:
         """Take one more chunk, already cleaned, into account."""
@@ -197,20 +206,20 @@ def _without_outliers(scene: GaussianCloud | CloudChunks, choices: SaveChoices) 
 
 
 def scan_chunks(chunks: CloudChunks, choices: SaveChoices) -> Scan:
-    """Go through the scene once: invalid splats, bounds, highest band in use.
+    """Go through the scene: invalid splats, bounds, highest band in use; before that from where it is looked at, if it is.
 
     Raises
     ------
     CloudError
         `strict` and there are invalid splats.
     """
-    scan = Scan()
+    scan = Scan(view=_view(chunks, choices))
     with stage("reading", len(chunks)) as progress:
         for chunk in chunks:
             scan.num_splats += len(chunk)
-            scan.add(_clean(chunk, choices, scan.dropped))
+            scan.add(_clean(chunk, choices, scan.view, scan.dropped))
             progress.advance(len(chunk))
-    invalid = {cause: count for cause, count in scan.dropped.items() if cause != "pruned-opacity"}
+    invalid = {cause: count for cause, count in scan.dropped.items() if cause not in ("pruned-opacity", "pruned-faint")}
     if choices.strict and invalid:
         raise CloudError(
             f"{sum(invalid.values())} of {scan.num_splats} splats would be dropped: {counts_in_words(invalid)}; "
@@ -220,16 +229,26 @@ def scan_chunks(chunks: CloudChunks, choices: SaveChoices) -> Scan:
     return scan
 
 
-def _clean(chunk: GaussianCloud, choices: SaveChoices, dropped: Counter[str] | None = None) -> GaussianCloud:
-    """Drop invalid and pruned splats of a chunk, counting them."""
-    from gsplat_tools.ops.filtering import drop_invalid, prune_opacity
+def _view(chunks: CloudChunks, choices: SaveChoices) -> Viewpoint | None:
+    """Return from where valid and opaque splats are looked at; None where nothing is dropped for being faint."""
+    if not choices.prune_faint:
+        return None
+    return viewpoint_of((_clean(chunk, choices) for chunk in chunks), len(chunks))
+
+
+def _clean(
+    chunk: GaussianCloud, choices: SaveChoices, view: Viewpoint | None = None, dropped: Counter[str] | None = None
+) -> GaussianCloud:
+    """Drop invalid and pruned splats of a chunk, counting them; with a view, faint ones too."""
+    from gsplat_tools.ops.filtering import drop_invalid, prune_faint, prune_opacity
 
     kept, causes = drop_invalid(chunk)
     kept, pruned = prune_opacity(kept, choices.prune_opacity)
+    causes["pruned-opacity"] = pruned
+    if view is not None and choices.prune_faint:
+        kept, causes["pruned-faint"] = prune_faint(kept, choices.prune_faint, view)
     if dropped is not None:
-        dropped.update(causes)
-        if pruned:
-            dropped["pruned-opacity"] += pruned
+        dropped.update({cause: count for cause, count in causes.items() if count})
     return kept
 
 
@@ -240,6 +259,7 @@ class Fit:
         self._target = target
         self._choices = choices
         self._drops_anything = bool(scan.dropped)
+        self._view = scan.view
         self._source_system, self._target_system = self._choose_coordinates(template)
         self._sh_degree = self._choose_degree(template, scan)
         self._drops_motion = template.has_motion and not target.holds_motion
@@ -268,7 +288,7 @@ class Fit:
 
     def __call__(self, chunk: GaussianCloud) -> GaussianCloud:
         """Clean a chunk as it was found and apply the decisions to it."""
-        return self.apply(_clean(chunk, self._choices) if self._drops_anything else chunk)
+        return self.apply(_clean(chunk, self._choices, self._view) if self._drops_anything else chunk)
 
     def apply(self, chunk: GaussianCloud) -> GaussianCloud:
         """Apply the decisions to splats that are already clean."""

@@ -17,6 +17,7 @@ from gsplat_tools.errors import CloudError, counts_in_words
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.loading import warn_dropped
 from gsplat_tools.formats.preparing import Fit, Prepared, SaveChoices, Scan
+from gsplat_tools.ops.visibility import lit_pixels, viewpoint
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
 
@@ -30,13 +31,13 @@ class FrameFacts:
     codes
         (N,) the cause for which each splat is invalid, as `ops.filtering` numbers them; None where all are valid.
     visible
-        (N,) whether each is opaque enough, as packed bits; None where nothing is pruned.
+        (N,) whether each shows enough to stay, as packed bits, by the cause for which others may go.
     scan
         Bounds and highest band.
     """
 
     codes: NDArray[np.uint8] | None
-    visible: NDArray[np.uint8] | None
+    visible: dict[str, NDArray[np.uint8]]
     scan: Scan
 
 
@@ -47,10 +48,10 @@ def look_at_frame(frame: GaussianCloud, choices: SaveChoices, keeps: NDArray[np.
     scan = Scan()
     if keeps is not None:
         scan.add(frame.take(keeps))
-        return FrameFacts(None, None, scan)
+        return FrameFacts(None, {}, scan)
     scan.add(frame)
-    visible = np.packbits(_is_at_least(frame, choices.prune_opacity)) if choices.prune_opacity > 0 else None
-    return FrameFacts(invalid_codes(frame), visible, scan)
+    codes = invalid_codes(frame)
+    return FrameFacts(codes, _visible(frame, codes, choices), scan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +107,7 @@ def kept_splats(facts: Iterable[FrameFacts], count: int, choices: SaveChoices) -
     from gsplat_tools.ops.filtering import count_causes
 
     keeps = np.ones(count, np.bool_)
-    visible = np.packbits(np.full(count, choices.prune_opacity == 0))
+    visible: dict[str, NDArray[np.uint8]] = {}
     causes: Counter[str] = Counter()
     scan = Scan(num_splats=count)
     for frame_id, each in enumerate(facts):
@@ -115,15 +116,17 @@ def kept_splats(facts: Iterable[FrameFacts], count: int, choices: SaveChoices) -
                 raise CloudError(f"invalid splats: {counts_in_words(count_causes(each.codes))}", frame=frame_id)
             causes.update(count_causes(each.codes[keeps]))
             keeps &= each.codes == 0
-        if each.visible is not None:
-            visible |= each.visible
+        for cause, shown in each.visible.items():
+            visible[cause] = visible[cause] | shown if cause in visible else shown
         scan.merge(each.scan)
     warn_dropped(dict(causes), count)
-    is_visible = np.unpackbits(visible, count=count).astype(np.bool_)
-    pruned = int(np.count_nonzero(keeps & ~is_visible))
-    if pruned:
-        causes["pruned-opacity"] = pruned
-    return Kept(keeps & is_visible, scan, dict(causes))
+    for cause, shown in visible.items():
+        is_visible = np.unpackbits(shown, count=count).astype(np.bool_)
+        pruned = int(np.count_nonzero(keeps & ~is_visible))
+        if pruned:
+            causes[cause] = pruned
+        keeps &= is_visible
+    return Kept(keeps, scan, dict(causes))
 
 
 def with_scan(kept: Kept, facts: Iterable[FrameFacts]) -> Kept:
@@ -186,8 +189,14 @@ def fitted_sequence(sequence: GaussianSequence, fit: FrameFit) -> GaussianSequen
     )
 
 
-def _is_at_least(cloud: GaussianCloud, opacity: float) -> NDArray[np.bool_]:
-    """Whether each splat is at least this opaque."""
+def _visible(frame: GaussianCloud, codes: NDArray[np.uint8] | None, choices: SaveChoices) -> dict[str, NDArray[np.uint8]]:
+    """Return which splats of a frame show enough to stay, looked at from where the valid ones of this frame are."""
     from gsplat_tools.attributes.activations import sigmoid
 
-    return sigmoid(cloud.opacity_logits) >= opacity
+    visible = {}
+    if choices.prune_opacity > 0:
+        visible["pruned-opacity"] = np.packbits(sigmoid(frame.opacity_logits) >= choices.prune_opacity)
+    if choices.prune_faint:
+        view = viewpoint(frame if codes is None else frame.take(codes == 0))
+        visible["pruned-faint"] = np.packbits(lit_pixels(frame, view) >= choices.prune_faint)
+    return visible

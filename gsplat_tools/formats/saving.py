@@ -23,6 +23,7 @@ from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import located
 from gsplat_tools.formats.preparing import Prepared, SaveChoices, prepare
 from gsplat_tools.formats.registry import FORMATS, find_format, format_of_extension
+from gsplat_tools.ops.visibility import faint_pixels
 from gsplat_tools.sequence import GaussianSequence
 
 DEFAULT_PRESET = "balanced"
@@ -134,8 +135,11 @@ def split_options(record: Format, preset: str, options: dict[str, Any]) -> tuple
     chosen = {**record.presets.get(preset, {}), **options}
     choices = SaveChoices(**{name: value for name, value in chosen.items() if name in general})
     written = record.write_options(**{name: value for name, value in chosen.items() if name in own})
+    tolerance = getattr(written, "visual_tolerance", 0.0)
     if choices.outliers == "auto":
-        choices = replace(choices, outliers="drop" if getattr(written, "visual_tolerance", 0) > 0 else "keep")
+        choices = replace(choices, outliers="drop" if tolerance > 0 else "keep")
+    if choices.prune_faint is None:
+        choices = replace(choices, prune_faint=faint_pixels(tolerance))
     return choices, written
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CloudError, counts_in_words
+from gsplat_tools.ops.visibility import Viewpoint, lit_pixels
 from gsplat_tools.parallel import run_blocks
 
 # Which infinities are legal, as kernels.validity numbers them; that module is imported where it runs.
@@ -116,6 +117,28 @@ def prune_opacity(cloud: GaussianCloud, threshold: float) -> tuple[GaussianCloud
     from gsplat_tools.attributes.activations import sigmoid
 
     is_faint = sigmoid(cloud.opacity_logits) < threshold
+    count = int(np.count_nonzero(is_faint))
+    return (cloud.take(~is_faint), count) if count else (cloud, 0)
+
+
+def prune_faint(cloud: GaussianCloud, threshold: float, view: Viewpoint) -> tuple[GaussianCloud, int]:
+    """Drop splats that hardly show.
+
+    Parameters
+    ----------
+    cloud
+        N valid Gaussians.
+    threshold
+        Lit pixels (`ops.visibility.lit_pixels`); splats below are dropped.
+    view
+        From where the scene is looked at.
+
+    Returns
+    -------
+    tuple
+        The other splats, the same cloud where none is dropped · the number of those dropped.
+    """
+    is_faint = lit_pixels(cloud, view) < threshold
     count = int(np.count_nonzero(is_faint))
     return (cloud.take(~is_faint), count) if count else (cloud, 0)
 

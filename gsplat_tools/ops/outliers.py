@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.ops.visibility import trace_areas, viewpoint
+from gsplat_tools.ops.visibility import lit_pixels, viewpoint
 
 FAR = 1.5
 """Distance from which a splat counts as far, in radii of the bulk of the scene."""
@@ -38,8 +38,6 @@ def find_outliers(cloud: GaussianCloud) -> NDArray[np.bool_]:
     much farther, a splat of opacity o whose trace has the half axes a and b draws o exp(-r^2 / 2). Leaving it out changes
     each channel by at most that: by pi a b o^2 in energy, three times for three channels. No picture is drawn.
     """
-    from gsplat_tools.attributes.activations import sigmoid
-
     none = np.zeros(len(cloud), np.bool_)
     if len(cloud) < 2:
         return none
@@ -48,8 +46,7 @@ def find_outliers(cloud: GaussianCloud) -> NDArray[np.bool_]:
     far = np.linalg.norm(means - np.asarray(view.center), axis=1) > FAR * view.radius
     if not far.any():
         return none
-    opacities = sigmoid(cloud.opacity_logits.astype(np.float64))
-    candidates = far & (3 * trace_areas(cloud, cloud.log_scales, view) * np.square(opacities) <= MOST_SHOWN)
+    candidates = far & (3 * lit_pixels(cloud, view) <= MOST_SHOWN)
     if not candidates.any() or candidates.all():
         return none
     low, high = means[~candidates].min(axis=0), means[~candidates].max(axis=0)

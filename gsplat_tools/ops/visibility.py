@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,6 +35,11 @@ MAX_PIXELS = 10.0
 _COLOR_FACTOR = 16.0
 _SCALE_FACTOR = 8.0
 _TURN_FACTOR = 3.0
+
+# Leaving out a splat saves about ten bytes in .sog4d and .sog. Neighbors go together and all darken the picture, so that
+# what they show adds up. Counted 3 times; 2 and 4 suit some scenes better and others worse (docs/visual-tolerance.md).
+_SPLAT_BITS = 80.0
+_FAINT_FACTOR = 3.0
 
 # Of float32 and of float64 differences of large numbers.
 _ROUNDING = 1e-5
@@ -127,12 +133,19 @@ def tolerance_from_json(value: Any) -> Tolerance | None:
 
 
 def viewpoint(cloud: GaussianCloud) -> Viewpoint:
-    """Return from where a scene is looked at.
+    """Return from where a scene is looked at; see `viewpoint_of`."""
+    return viewpoint_of([cloud], len(cloud))
+
+
+def viewpoint_of(pieces: Iterable[GaussianCloud], count: int) -> Viewpoint:
+    """Return from where a scene in pieces is looked at.
 
     Parameters
     ----------
-    cloud
-        At least one splat, means finite.
+    pieces
+        Splats with finite means, gone through once.
+    count
+        About how many they are together; of large scenes, every so many-th is looked at.
 
     Returns
     -------
@@ -142,9 +155,16 @@ def viewpoint(cloud: GaussianCloud) -> Viewpoint:
     """
     from gsplat_tools.attributes.activations import sigmoid
 
-    step = max(1, -(-len(cloud) // _MAX_SAMPLES))
-    means = cloud.means[::step].astype(np.float64)
-    weights = sigmoid(cloud.opacity_logits[::step].astype(np.float64))
+    step = max(1, -(-count // _MAX_SAMPLES))
+    samples, passed = list[tuple[NDArray[np.float32], ...]](), 0
+    for piece in pieces:
+        rows = slice(-passed % step, None, step)
+        samples.append((piece.means[rows].copy(), piece.log_scales[rows].copy(), piece.opacity_logits[rows].copy()))
+        passed += len(piece)
+    if passed == 0:
+        return Viewpoint((0.0, 0.0, 0.0), 1.0)
+    positions, log_scales, logits = (np.concatenate(arrays) for arrays in zip(*samples, strict=True))
+    means, weights = positions.astype(np.float64), sigmoid(logits.astype(np.float64))
     if not weights.sum() > 0:
         weights = np.ones(len(means))
     low, high = (
@@ -154,7 +174,7 @@ def viewpoint(cloud: GaussianCloud) -> Viewpoint:
     center = (low + high) / 2
     radius = _weighted_quantile(np.linalg.norm(means - center, axis=1), weights, _RADIUS_SHARE)
     if radius <= 0:  # one splat, or all in one place: its size is what there is to see
-        radius = float(3 * np.exp(np.clip(np.median(cloud.log_scales), -20, 20)))
+        radius = float(3 * np.exp(np.clip(np.median(log_scales), -20, 20)))
     return Viewpoint((float(center[0]), float(center[1]), float(center[2])), radius)
 
 
@@ -207,11 +227,37 @@ def visible_costs(cloud: GaussianCloud, log_scales: NDArray[np.float32], pixels:
     return VisibleCosts(**{name: np.maximum(values, _MIN_COST) for name, values in costs.items()})
 
 
-def trace_areas(cloud: GaussianCloud, log_scales: NDArray[np.float32], view: Viewpoint) -> Float64:
-    """Return pi a b of the largest trace of each splat, (N,) px^2: the integral of exp(-r^2)."""
-    ordered = np.sort(_variances(log_scales, view.pixels_per_unit(cloud.means)), axis=1)
-    area: Float64 = np.pi * np.sqrt(ordered[:, 2] * ordered[:, 1])
-    return area
+def lit_pixels(cloud: GaussianCloud, view: Viewpoint) -> Float64:
+    """Return what each splat can show in one channel, (N,): the energy of its trace, in pixels turned from black to white.
+
+    Parameters
+    ----------
+    cloud
+        N splats. Those that move are taken to come as near as the bulk of the scene is.
+    view
+        From where the scene is looked at.
+
+    Notes
+    -----
+    pi a b o^2, the integral of (o exp(-r^2 / 2))^2 over the largest trace of a splat of opacity o, half axes a and b.
+    Whatever lies behind it, taking it away changes a channel by no more.
+    """
+    from gsplat_tools.attributes.activations import sigmoid
+
+    scale = view.pixels_per_unit(cloud.means)
+    if cloud.has_motion:
+        scale = np.full(len(cloud), PICTURE_SIZE / 2 / view.radius)
+    ordered = np.sort(_variances(cloud.log_scales, scale), axis=1)
+    energy = np.pi * np.sqrt(ordered[:, 2] * ordered[:, 1]) * np.square(sigmoid(cloud.opacity_logits.astype(np.float64)))
+    return np.asarray(energy, np.float64)
+
+
+def faint_pixels(pixels: float) -> float:
+    """Return the lit pixels below which a splat is not worth its bits at a tolerance; 0 without one.
+
+    Over three channels, and counted `_FAINT_FACTOR` times, it then shows less than what `_SPLAT_BITS` are traded for.
+    """
+    return _SPLAT_BITS * np.pi / 2 * pixels**2 / (3 * _FAINT_FACTOR)
 
 
 def _variances(log_scales: NDArray[np.float32], scale: Float64) -> Float64:

@@ -102,7 +102,7 @@ def tune(
         raise ValidationError("the views show nothing of the scene, so that no choice can be judged by them")
     if budget is not None:
         tuned.found = searcher.find(budget)
-        tuned.options = {**({"outliers": "keep"} if keeps_splats else {}), **options, **tuned.found.options}
+        tuned.options = {**searcher.whole.fixed, **tuned.found.options}
         tuned.decisions += [_of_search(each) for each in tuned.found.decisions]
         return tuned
     usual = searcher.whole.encode({})

@@ -173,14 +173,20 @@ class Hunt:
             if stream.name not in {"container", "splats", "codes"}:
                 continue
             for name, knob in stream.knobs.items():
-                finest_first = [value for value in reversed(knob.values) if value != options.get(name, 0)]
-                for value in finest_first[:_STEPS]:
-                    changed = {**options, name: value}
+                tried = [value for value in knob.values if value != options.get(name, 0)]
+                if not knob.graded:
+                    tried = tried[: -_STEPS - 1 : -1]
+                while tried:
+                    middle = len(tried) // 2 if knob.graded else 0
+                    changed = {**options, name: tried[middle]}
                     found = self._try(changed, trial.bytes - 1)
-                    if found is not None and found.bytes < trial.bytes and self._holds(found):
+                    holds = found is not None and found.bytes < trial.bytes and self._holds(found)
+                    if found is not None and holds:
                         options, trial = changed, found
-                    elif stream.name != "container":
-                        break
+                    if knob.graded:  # from coarsest to finest: the coarsest that holds lies on one side
+                        tried = tried[:middle] if holds else tried[middle + 1 :]
+                    else:
+                        tried = tried[1:] if holds or stream.name == "container" else []
         return options, trial, why
 
     def _propose(self, margin: float) -> Choice | None:

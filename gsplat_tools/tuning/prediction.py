@@ -201,7 +201,7 @@ def _decoded(cloud: GaussianCloud, setting: Setting) -> tuple[GaussianCloud | No
     def remember(_stream: BinaryIO, prepared: Prepared, _record: Format) -> None:
         systems.append(cloud_of(prepared.scene, 0).coordinate_system)
 
-    options = {**setting.options, "order": "none", "prune_opacity": 0.0}
+    options = {**setting.options, "order": "none", "prune_opacity": 0.0, "prune_faint": 0.0, "outliers": "keep"}
     with tempfile.TemporaryDirectory() as folder:
         report = _save(cloud, Path(folder), setting, check=remember, **options)
         with open_scene(report.path, in_chunks=False, as_format=setting.format) as scene:

@@ -30,6 +30,9 @@ SEARCH_SPLATS = 1 << 16
 SEARCH_FRAMES = 3
 """Frames at the start of a sequence that stand for it while searching."""
 
+_SPLATS = {"prune_opacity", "prune_faint"}
+"""Options that say which splats are left out: where one is given, the others are not turned."""
+
 
 def search(
     scene: GaussianCloud | GaussianSequence,
@@ -102,7 +105,11 @@ class Searcher:
         keep_splats: bool = False,
     ) -> None:
         self._scene, self._keeps_splats = scene, keep_splats
-        pinned = {**({"outliers": "keep"} if keep_splats else {}), **(pinned or {})}
+        pinned = dict(pinned or {})
+        if keep_splats:
+            pinned.setdefault("outliers", "keep")
+        if keep_splats or pinned.keys() & _SPLATS:
+            pinned.setdefault("prune_faint", 0.0)  # which a visual tolerance would set
         self.whole = Trials(Workbench(scene, views=views, size=size, model=model), record, preset, pinned)
         half = max(size[0] // 2, 1), max(size[1] // 2, 1)
         self._part = Trials(Workbench(_part(scene), views=views, size=half, model=model), record, preset, pinned)
@@ -153,7 +160,7 @@ def turnable(
     for name, knob in record.knobs.items():
         if name in given or (knob.sequences_only and not isinstance(scene, GaussianSequence)):
             continue
-        if keep_splats and knob.stream == "splats":
+        if knob.stream == "splats" and (keep_splats or given.keys() & _SPLATS):
             continue
         if any(each in given and given[each] not in values for each, values in knob.needs.items()):
             continue

@@ -189,6 +189,16 @@ def test_sh_rows_for_other_splats__are_refused():
         read(ply_file(*parts))
 
 
+def test_sh_rows_without_properties__are_no_sh():
+    plain = ply_file(*elements(3))
+
+    cloud = read(plain.replace(b"end_header", b"element sh 3\nend_header"))
+
+    assert cloud.sh_degree == 0
+    for name, values in read(plain).arrays().items():
+        np.testing.assert_array_equal(cloud.arrays()[name], values)
+
+
 def test_text__is_refused():
     with pytest.raises(UnsupportedVersionError, match="binary"):
         read(ply_file(*elements(), encoding="ascii"))

@@ -12,11 +12,11 @@ import pytest
 
 from gsplat_tools.attributes.quaternions import to_matrix
 from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.codecs.quaternion_u8 import encode_constant_w
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
 from gsplat_tools.formats.sog4d import Sog4dOptions, Sog4dReadOptions, read, write
 from gsplat_tools.formats.sog4d.bounds import rotation_bound, scale_reach
 from gsplat_tools.formats.sog4d.codebooks import falling_frames, scale_coordinates, scales_at, turned
-from gsplat_tools.formats.sog4d.frame import constant_w_bytes
 from gsplat_tools.parallel import use_jobs
 from tests.clouds import random_cloud
 
@@ -130,7 +130,7 @@ def test_constant_w__has_one_value_of_w_and_half_step_errors() -> None:
     cloud = random_cloud(2000, sh_degree=0).replace(quats=rng.normal(size=(2000, 4)).astype(np.float32))
     quats, _ = turned(cloud, falling_frames(cloud))
 
-    codes = constant_w_bytes(quats, 64)
+    codes = encode_constant_w(quats, 64)
 
     assert set(codes[:, 0].tolist()) == {128 + 64}
     stored = codes.astype(np.float64) - 128
@@ -142,7 +142,7 @@ def test_constant_w__has_one_value_of_w_and_half_step_errors() -> None:
 
 @pytest.mark.parametrize("quat", [(0, 1, 0, 0), (0.001, -1, 1, 1), (0, 0, 0, 0), (-1, 0.5, 0.5, 0.5), (1e-20, 1e-20, 0, 0)])
 def test_constant_w__shortens_what_does_not_fit(quat: tuple[float, ...]) -> None:
-    codes = constant_w_bytes(np.array([quat], np.float32), 127)
+    codes = encode_constant_w(np.array([quat], np.float32), 127)
 
     stored = codes[0].astype(np.float64) - 128
     wanted = np.array(quat, np.float64) if any(quat) else np.array([1.0, 0, 0, 0])

@@ -67,7 +67,7 @@ def test_save__drops_and_counts_them_with_a_tolerance_or_when_told_and_not_other
 
     assert dropped() == {}
     assert dropped(visual_tolerance=0.05) == {"outliers": 2}
-    assert dropped(visual_tolerance=0.05, outliers="keep") == {}
+    assert dropped(visual_tolerance=0.05, outliers="keep", prune_faint=0) == {}
     assert dropped(outliers="drop") == {"outliers": 2}
     assert dropped(outliers="drop", prune_opacity=0.1) == {"pruned-opacity": 2}
     assert save(stretched, tmp_path / "a.spz", outliers="drop").dropped == {"outliers": 2}  # a writer that streams

@@ -44,8 +44,8 @@ def test_settings__turn_a_long_knob_to_a_few_values_with_its_ends() -> None:
     record = FORMATS["sog4d"]
     options = [setting.options for setting in settings_of(record, 3, knobs=True, moves=False)]
 
-    pruned = [each["prune_opacity"] for each in options if "prune_opacity" in each]
-    values = record.knobs["prune_opacity"].values
+    pruned = [each["prune_faint"] for each in options if "prune_faint" in each]
+    values = record.knobs["prune_faint"].values
     assert len(pruned) <= 6
     assert values[0] in pruned
     assert not any(name in each for each in options for name, knob in record.knobs.items() if knob.sequences_only)

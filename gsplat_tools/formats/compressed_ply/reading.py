@@ -114,6 +114,7 @@ def open_packed(stream: BinaryIO) -> PackedPly:
                 f"expected a row for each of {vertex.count} splats, found {sh.count}", field="sh", offset=sh.line_offset
             )
         degree = counts.index(number)
+        sh = sh if degree else None  # rows of no bytes
     comments = splat_comments(header, is_flat=False)
     check_splats(vertex.count, degree, None, field="vertex", offset=vertex.line_offset)
     return PackedPly(header, comments, chunk, vertex, sh, element_offsets(header, stream), degree)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CloudError
+from gsplat_tools.formats.sog4d import balancing
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
-from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, MAX_CODEBOOK, SH0_ENTRIES
-from gsplat_tools.ops.visibility import MOST, Tolerance, viewpoint
+from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, SH0_ENTRIES
+from gsplat_tools.ops.visibility import Tolerance, viewpoint
 from gsplat_tools.parallel import run_blocks
 
 Float32 = NDArray[np.float32]
@@ -41,8 +42,8 @@ _SCALE_GRID = 0.7
 _CENTROID_GRID = 0.5
 _FINE_STEP = 0.03
 
-_ENTRY_BITS = 40.0
-"""Of the text of a scale triple, deflated."""
+DEFAULT_SH0_ENTRIES, DEFAULT_ROTATION_STEPS = 128, 64
+"""Where neither the options nor a visual tolerance say otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,15 +201,27 @@ def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layo
     """
     shared = fit_codebooks(sample, len(first), options, layout)
     shared = for_splats(shared, first, long_splats(first) if options.rotation == "small" else None)
-    if options.visual_tolerance == 0:
-        return shared
+    return _balanced(shared, sample, first, options) if options.visual_tolerance > 0 else shared
+
+
+def _balanced(shared: Shared, sample: Sample, first: GaussianCloud, options: Sog4dOptions) -> Shared:
+    """Return codebooks and steps as fine as what they show is worth, where the options leave that open."""
     tolerance = Tolerance(options.visual_tolerance, viewpoint(first))
+    quats, log_scales = turned(first, shared.rotation_frames)
+    costs = tolerance.costs(first, log_scales)
+    shared = replace(shared, tolerance=tolerance)
     if options.scale_codebook_size is None:
-        turned_scales = turned(first, shared.rotation_frames)[1]
-        size = _balanced_scale_size(shared.scale_codebook, first, turned_scales, tolerance)
+        size = balancing.scale_size(shared.scale_points, scale_coordinates(log_scales), costs)
         codebook, error = _fit_scales(sample, options, size)
         shared = replace(shared, scale_codebook=codebook, scale_error=error)
-    return replace(shared, tolerance=tolerance)
+    if options.sh0_entries is None:
+        entries = balancing.color_entries(lambda count: _fit_sh0(sample, count), first.sh0, costs)
+        codebook = BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, entries)
+        shared = replace(shared, sh0_codebook=codebook, options=replace(shared.options, sh0_entries=entries))
+    if options.rotation_steps is None and options.rotation == "small":
+        steps = balancing.rotation_steps(quats, costs)
+        shared = replace(shared, options=replace(shared.options, rotation_steps=steps))
+    return shared
 
 
 def fit_codebooks(sample: Sample, num_splats: int, options: Sog4dOptions, layout: tuple[int, int]) -> Shared:
@@ -216,14 +229,15 @@ def fit_codebooks(sample: Sample, num_splats: int, options: Sog4dOptions, layout
     bands = REST_COEFFICIENTS.index(sample.shN.shape[1])
     size = options.scale_codebook_size or int(options.detail * default_scale_size(num_splats))
     codebook, error = _fit_scales(sample, options, size)
+    entries, steps = options.sh0_entries or DEFAULT_SH0_ENTRIES, options.rotation_steps or DEFAULT_ROTATION_STEPS
     return Shared(
-        options=options,
+        options=replace(options, sh0_entries=entries, rotation_steps=steps),
         width=layout[0],
         height=layout[1],
         bands=bands,
         scale_codebook=codebook,
         scale_error=error,
-        sh0_codebook=BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, options.sh0_entries),
+        sh0_codebook=BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, entries),
         palettes=_fit_palettes(sample, bands, num_splats, options),
     )
 
@@ -290,22 +304,6 @@ def turned(cloud: GaussianCloud, frames: NDArray[np.uint8] | None) -> tuple[Floa
     quats, log_scales = np.empty_like(cloud.quats), np.empty_like(cloud.log_scales)
     apply_frames(cloud.quats, cloud.log_scales, frames, quats, log_scales)
     return quats, log_scales
-
-
-def _balanced_scale_size(codebook: Float32, cloud: GaussianCloud, log_scales: Float32, tolerance: Tolerance) -> int:
-    """Return the size, at least the given, at which one more entry saves in what shows what it costs in bits.
-
-    Between them, N splats pay log2 K bits each for their label and the text of K entries; what shows falls as 1 / K.
-    """
-    from gsplat_tools.codecs.palette import nearest_labels
-
-    entries = points_of(codebook)
-    _, squares = nearest_labels(scale_coordinates(log_scales), entries)
-    shown = float(np.minimum(tolerance.costs(cloud, log_scales).scale * squares, MOST).sum())
-    # The root of a K^2 + b K = shown x size: the derivatives balance.
-    a, b = _ENTRY_BITS, len(cloud) / np.log(2)
-    size = (np.sqrt(b * b + 4 * a * shown * len(codebook)) - b) / (2 * a)
-    return int(np.clip(size, len(codebook), max(len(codebook), min(4 * len(codebook), MAX_CODEBOOK))))
 
 
 def _fit_scales(sample: Sample, options: Sog4dOptions, size: int) -> tuple[Float32, float]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.formats.sog4d.codebooks import Shared, scale_coordinates, turned
+from gsplat_tools.formats.sog4d.codebooks import DEFAULT_ROTATION_STEPS, Shared, scale_coordinates, turned
 from gsplat_tools.formats.sog4d.labels import Labels
 from gsplat_tools.formats.sog4d.textures import index_columns
 from gsplat_tools.ops.visibility import MOST, VisibleCosts
@@ -151,25 +151,10 @@ def rotation_bytes(quats: Float32, shared: Shared) -> NDArray[np.uint8]:
     mode = shared.options.rotation
     if mode != "small":
         return quaternion_u8.encode(quats, mode=mode)
-    codes = constant_w_bytes(quats, shared.options.rotation_steps)
+    codes = quaternion_u8.encode_constant_w(quats, shared.options.rotation_steps or DEFAULT_ROTATION_STEPS)
     if shared.is_long is not None:
         codes[shared.is_long] = quaternion_u8.encode(quats[shared.is_long], mode="best")
     return codes
-
-
-def constant_w_bytes(quats: Float32, steps: int) -> NDArray[np.uint8]:
-    """Return quaternions with w as the same number of steps everywhere, so that one byte of four says nothing.
-
-    Where w is not the largest component (later frames of a sequence) the quaternion is shortened until all fit.
-    """
-    wide = quats.astype(np.float64)
-    wide *= np.where(wide[:, :1] < 0, -1.0, 1.0)
-    largest = np.abs(wide).max(axis=1, keepdims=True)
-    is_null = largest == 0
-    wide[is_null[:, 0]] = (1, 0, 0, 0)
-    # 127 steps for the largest component are the end of the byte.
-    scale = np.minimum(steps / np.maximum(wide[:, :1], 1e-30), 127 / np.where(is_null, 1.0, largest))
-    return (np.rint(wide * scale) + 128).astype(np.uint8)
 
 
 def opacity_bytes(logits: Float32) -> NDArray[np.uint8]:

@@ -60,7 +60,7 @@ class Sog4dOptions:
     sh0_codebook
         "fit": the optimum for the data; "base-rgb": the fixed table of 256 colors in [0, 1].
     sh0_entries
-        Entries of the codebook that are used, 2 to 256; fewer make smaller files.
+        Entries of the codebook that are used, 2 to 256; fewer make smaller files. By default 128.
     webp_effort
         0 (fastest) to 9 (smallest).
     zip
@@ -70,7 +70,7 @@ class Sog4dOptions:
         axes of a splat are named so that its scales fall, once for all frames.
     rotation_steps
         With "small", the byte steps of w, 16 to 127; the error is at most atan(sqrt(3) / 2 / steps) times two, and fewer
-        steps make smaller files.
+        steps make smaller files. By default 64.
     palette_rounds
         Rounds of k-means for SH palettes at most.
     keep_tolerance
@@ -79,7 +79,7 @@ class Sog4dOptions:
     visual_tolerance
         Pixels, 0 for none: codes move to neighbors that compress better where that shows no more than a bit's worth, the
         shift of an opaque round splat by so many pixels in a picture in which the scene spans 1,000. The size of the scale
-        codebook, where it is not given, follows from it.
+        codebook, the entries of the color codebook and the steps of rotations, where they are not given, follow from it.
     time_mapping
         "uniform", "explicit", or "auto": as the source has it.
     frame_times
@@ -98,11 +98,11 @@ class Sog4dOptions:
     detail: float = 1.0
     centroids: Literal["f16", "f32"] = "f16"
     sh0_codebook: Literal["fit", "base-rgb"] = "fit"
-    sh0_entries: int = 128
+    sh0_entries: int | None = None
     webp_effort: int = DEFAULT_EFFORT
     zip: ZipMode = "auto"
     rotation: RotationMode = "small"
-    rotation_steps: int = 64
+    rotation_steps: int | None = None
     palette_rounds: int = 5
     keep_tolerance: float = 0.05
     visual_tolerance: float = 0.0

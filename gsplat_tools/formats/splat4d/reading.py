@@ -150,7 +150,9 @@ def _finished(cloud: GaussianCloud, time_model: TimeModel, cutoff: float) -> Gau
     assert cloud.velocities is not None
     assert cloud.times is not None
     assert cloud.durations is not None
-    stands_still = not cloud.velocities.any() and not cloud.times.any() and bool((cloud.durations == 1).all())
+    # Compared, not any(): numpy warns of a signaling NaN as it turns one into a truth value.
+    moves = (cloud.velocities != 0).any() or (cloud.times != 0).any()
+    stands_still = not moves and bool((cloud.durations == 1).all())
     if stands_still and time_model == "window":
         return cloud.replace(velocities=None, times=None, durations=None)
     return cloud

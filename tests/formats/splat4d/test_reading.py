@@ -56,6 +56,16 @@ def test_read__normalizes_rotations_and_takes_all_128_for_the_identity() -> None
     assert cloud.quats.tolist() == [[1, 0, 0, 0], [1, 0, 0, 0], [0.5, 0.5, -0.5, -0.5]]
 
 
+def test_read__takes_signaling_nans_without_a_warning_of_numpy() -> None:
+    data = bytearray(record(velocity=(0, 0, 0), time=0.0, duration=1.0) * 2)
+    data[32:36] = (0x7FA00000).to_bytes(4, "little")  # the first component of the first velocity
+
+    cloud = read_bytes(bytes(data))
+
+    assert cloud.velocities is not None
+    assert np.isnan(cloud.velocities[0, 0])
+
+
 def test_read__takes_the_ends_of_opacity_for_infinite_logits() -> None:
     cloud = read_bytes(record(rgba=(0, 0, 0, 0)) + record(rgba=(0, 0, 0, 255)))
 
