@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from gsplat_tools.chunks import CHUNK_SIZE
 from gsplat_tools.cli.convert import main
 from gsplat_tools.cluster import block_tasks, blocks
 from gsplat_tools.cluster.arranging import _Draw, row_type
@@ -36,15 +37,16 @@ QUICK = {"sh_palette_size": 40, "scale_codebook_size": 60, "webp_effort": 0}
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Scenes of degree 0 to 3, and one with invalid splats."""
+    """Scenes of degree 0 to 3, one with invalid splats, and one that is read in three chunks of unlike length."""
     folder = tmp_path_factory.mktemp("scenes")
     for degree in range(4):
         save(random_cloud(SPLATS, sh_degree=degree, seed=degree), folder / f"{degree}.ply")
-    cloud = random_cloud(SPLATS, sh_degree=1, seed=9)
-    means, quats = cloud.means.copy(), cloud.quats.copy()
-    means[::100] = np.nan
-    quats[50::100] = 0
-    save_raw(cloud.replace(means=means, quats=quats), folder / "invalid.ply")
+    for name, count, degree in (("invalid", SPLATS, 1), ("chunks", 2 * CHUNK_SIZE + 5000, 0)):
+        cloud = random_cloud(count, sh_degree=degree, seed=9)
+        means, quats = cloud.means.copy(), cloud.quats.copy()
+        means[::97] = np.nan
+        quats[50::101] = 0
+        save_raw(cloud.replace(means=means, quats=quats), folder / f"{name}.ply")
     return folder
 
 
@@ -72,6 +74,8 @@ def in_blocks(source: Path, target: Path, **options: Any) -> Any:
         ("1", {"order": "none", "labels": "delta-v1", "rotation": "best", "sh0_codebook": "base-rgb", "zip": "stored"}),
         ("2", {"sh_degree": 0, "time_mapping": "explicit", "width": 200, "seed": 7}),
         ("invalid", {"prune_opacity": 0.5}),
+        ("chunks", {"prune_opacity": 0.1, "prune_faint": 0.5}),
+        ("chunks", {"preset": "best", "webp_effort": 0}),
     ],
 )
 def test_blocks__give_the_bytes_of_one_machine(scenes: Path, tmp_path: Path, name: str, options: dict[str, Any]) -> None:
