@@ -28,7 +28,8 @@ from gsplat_tools.comparison.rendered import MAX_RENDERED
 from gsplat_tools.errors import ClusterError, FormatError, ReadError
 from gsplat_tools.formats._atomic import replacing_in_any_order
 from gsplat_tools.formats._stores import LARGE_BLOCK_BYTES, exists, is_url, replacing_object
-from gsplat_tools.formats.preparing import Fit, SaveChoices, Scan, scan_chunks
+from gsplat_tools.formats.preparing import Fit, SaveChoices
+from gsplat_tools.formats.scanning import Scan, scan_chunks
 from gsplat_tools.formats.sog4d.codebooks import check_finite, drawn_rows, longest, visible_lengths
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
 from gsplat_tools.ops.importance import log_weights, top_weight
