@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gsplat_tools.cloud import GaussianCloud
     from gsplat_tools.comparison import compare
     from gsplat_tools.errors import GsplatError, GsplatWarning
-    from gsplat_tools.formats import FORMATS, load, save, use_max_memory
+    from gsplat_tools.formats import FORMATS, load, save, use_max_memory, use_store_timeout
     from gsplat_tools.formats.sequences import open_sequence
     from gsplat_tools.reference.camera import Camera
     from gsplat_tools.reference.rasterizer import render
@@ -34,6 +34,7 @@ _HOMES = {
     "save": "gsplat_tools.formats",
     "sort_by_depth": "gsplat_tools.reference.sorting",
     "use_max_memory": "gsplat_tools.formats",
+    "use_store_timeout": "gsplat_tools.formats",
 }
 
 __all__ = [
@@ -51,6 +52,7 @@ __all__ = [
     "save",
     "sort_by_depth",
     "use_max_memory",
+    "use_store_timeout",
 ]
 
 

@@ -28,7 +28,7 @@ LOCAL = "local"
 
 _OF_THE_COMMAND = (
     "batch", "state", "resume", "scheduler", "retries", "parts", "jobs", "max_memory", "as_json", "quiet", "progress",
-    "dry_run", "version", "help", "show_knobs", "block_splats",
+    "store_timeout", "dry_run", "version", "help", "show_knobs", "block_splats",
 )  # fmt: skip
 """Parameters that a row of a manifest cannot have."""
 

@@ -12,6 +12,7 @@ import click
 
 from gsplat_tools.attributes.coordinate_systems import is_known
 from gsplat_tools.formats._limits import use_max_memory
+from gsplat_tools.formats._store_requests import DEFAULT_STORE_TIMEOUT, TRIES, use_store_timeout
 from gsplat_tools.formats.registry import FORMATS
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -221,6 +222,24 @@ def max_memory_option(function: Callable[..., Any]) -> Callable[..., Any]:
         expose_value=False,
         callback=limit,
         help="Most bytes that the splats of a source may take, such as 4G; by default 1024 times its file.",
+    )(function)
+
+
+def store_timeout_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --store-timeout, which holds until the command ends, for its workers too."""
+
+    def limit(ctx: click.Context, _param: click.Parameter, value: float | None) -> None:
+        if value is not None:
+            ctx.with_resource(use_store_timeout(value))
+
+    return click.option(
+        "--store-timeout",
+        type=FiniteType(0.1, 86400),
+        metavar="SECONDS",
+        expose_value=False,
+        callback=limit,
+        help=f"How long a store (s3://, gs://) may take to answer a request, which is tried {TRIES} times; "
+        f"by default GSPLAT_STORE_TIMEOUT, or {DEFAULT_STORE_TIMEOUT:g}.",
     )(function)
 
 

@@ -197,6 +197,7 @@ def _takes(record: Format, flag: str, name: str) -> bool:
 @click.option("--model", type=click.Choice(options.MODELS), help="Rendering model to validate with; by default the target's.")
 @options.jobs_option
 @options.max_memory_option
+@options.store_timeout_option
 @click.option("--dry-run", is_flag=True, help="Estimate bytes, seconds and PSNR from a part of the scene; write nothing.")
 @click.option("--overwrite", is_flag=True, help="Replace a target that is there.")
 @options.json_option

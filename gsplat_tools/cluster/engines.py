@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import itertools
-import logging
+import os
 import re
+import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
-from gsplat_tools.cluster.outcomes import Outcome, is_passing, run_task
-from gsplat_tools.errors import CapabilityError, ClusterError, MissingDependencyError
+from gsplat_tools.cluster.on_dask import Dask
+from gsplat_tools.cluster.outcomes import DEFAULT_RETRIES, Outcome, Settings, caught, is_passing, run_task
+from gsplat_tools.errors import CapabilityError, ClusterError
 from gsplat_tools.parallel import num_jobs
 
-DEFAULT_RETRIES = 3
-"""Times that a task is tried again after an error that may pass, or after its worker died."""
+__all__ = ["DEFAULT_RETRIES", "Dask", "Engine", "InProcess", "Processes", "open_engine"]
 
 _FIRST_PAUSE = 0.2
 """Seconds before a task is tried again in a process of this machine; doubled each time."""
 
-LOST = "the same command continues: segments and scenes that are finished are kept"
+_END_SECONDS = 7.0
+"""Seconds that a process has to drop what it has half done; a store that hangs takes five of them."""
 
 
 class Engine(Protocol):
@@ -65,7 +68,7 @@ class InProcess:
     dashboard: str | None = None
 
     def __init__(self, jobs: int | None = None, retries: int = DEFAULT_RETRIES) -> None:
-        self._jobs, self._retries = jobs, retries
+        self._settings, self._retries = Settings(jobs), retries
         self.retried = 0
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> _Task:
@@ -80,7 +83,7 @@ class InProcess:
     def completed(self, pending: Sequence[_Task]) -> Iterator[tuple[int, Outcome | Exception]]:
         """Run the tasks."""
         for index, task in enumerate(pending):
-            yield index, _caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
+            yield index, caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
 
     def close(self) -> None:
         """Nothing is held."""
@@ -90,7 +93,7 @@ class InProcess:
             given = [self._outcome(each) if isinstance(each, _Task) else each for each in task.arguments]
             for attempt in itertools.count():
                 try:
-                    task.outcome = run_task(task.function, self._jobs, *given)
+                    task.outcome = run_task(task.function, self._settings, *given)
                     break
                 except Exception as error:
                     if attempt >= self._retries or not is_passing(error):
@@ -110,7 +113,7 @@ class Processes:
         self.name = f"local:{workers}"
         self.workers = workers
         self.retried = 0
-        self._jobs = jobs or max(1, num_jobs() // workers)
+        self._settings = Settings(jobs or max(1, num_jobs() // workers))
         self._retries = retries
         self._unfinished: list[_Task] = []
         self._start()
@@ -138,20 +141,31 @@ class Processes:
             for index in ended:
                 task = left[index]
                 if task.future is not None and task.future.done():  # not handed in again meanwhile
-                    yield index, _caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
+                    yield index, caught(lambda task=task: self._outcome(task))  # type: ignore[misc]
                     del left[index]
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes; those that are busy are told to drop what they have half done, which may take seconds."""
+        processes = list((self._pool._processes or {}).values())
+        busy = any(each.future is not None and not each.future.done() for each in self._unfinished)
         self._pool.shutdown(wait=False, cancel_futures=True)
+        if not busy:
+            return
+        for process in processes:
+            process.terminate()
+        end = time.monotonic() + _END_SECONDS
+        for process in processes:
+            process.join(max(0.0, end - time.monotonic()))
+            if process.is_alive():
+                process.kill()
 
     def _start(self) -> None:
         # Threads of this process make a fork unsafe.
-        self._pool = ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"))
+        self._pool = _pool(self.workers)
 
     def _send(self, task: _Task) -> None:
         with suppress(BrokenProcessPool):
-            task.future = self._pool.submit(run_task, task.function, self._jobs, *task.arguments)
+            task.future = self._pool.submit(_run_here, task.function, self._settings, *task.arguments)
             return
         self._restart(task)
 
@@ -165,7 +179,7 @@ class Processes:
         self._start()
         for each in self._unfinished:
             try:
-                each.future = self._pool.submit(run_task, each.function, self._jobs, *each.arguments)
+                each.future = self._pool.submit(_run_here, each.function, self._settings, *each.arguments)
             except BrokenProcessPool as error:  # one died again meanwhile: whoever waits for this task replaces it
                 each.future = Future()
                 each.future.set_exception(error)
@@ -173,9 +187,9 @@ class Processes:
     def _run_alone(self, task: _Task) -> None:
         """Run a task in a process of its own, to tell whether it is this one that ends processes."""
         self._unfinished.remove(task)
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with _pool(1) as pool:
             try:
-                task.outcome = pool.submit(run_task, task.function, self._jobs, *task.arguments).result()
+                task.outcome = pool.submit(_run_here, task.function, self._settings, *task.arguments).result()
             except BrokenProcessPool as error:
                 task.outcome = Outcome(
                     error=ClusterError(f"the task ended its process {task.tries + 1} times, for want of memory most likely")
@@ -203,125 +217,22 @@ class Processes:
         return task.outcome
 
 
-class Dask:
-    """Runs tasks on Dask: a cluster of this machine, or one that is running."""
-
-    def __init__(self, address: str, jobs: int | None = None, retries: int = DEFAULT_RETRIES) -> None:
-        try:
-            import distributed as imported
-        except ImportError as error:
-            raise MissingDependencyError(
-                "a cluster needs dask.distributed; install it with pip install 'gsplat_tools[cluster]'"
-            ) from error
-        self._cluster: Any = None
-        distributed: Any = imported
-        self._distributed = distributed
-        self._retries = retries
-        self.name = address
-        self.retried = 0
-        local = re.fullmatch(r"local-cluster:(\d+)", address)
-        try:
-            if local:
-                count = int(local[1])
-                jobs = jobs or max(1, num_jobs() // count)
-                self._cluster = distributed.LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs="CRITICAL",
-                )
-            self._client = distributed.Client(self._cluster or address, set_as_default=False)
-            self._client.wait_for_workers(1, timeout=60)
-        except (OSError, TimeoutError) as error:
-            raise ClusterError(f"no scheduler answers at {address}, or it has no workers: {error}") from error
-        self._jobs = jobs
-        self.workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
-        self.dashboard = self._client.dashboard_link
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Hand in a task."""
-        with self._explained():
-            return self._client.submit(
-                run_task, function, self._jobs, *arguments, retries=self._retries, pure=False, key=_key(function)
-            )
-
-    def results(self, pending: Sequence[Any]) -> Iterator[Outcome]:
-        """Wait for the tasks; where one fails, those that are not finished are given up."""
-        try:
-            for future in pending:
-                with self._explained():
-                    outcome = future.result()
-                yield outcome
-        except BaseException:
-            with suppress(Exception):
-                self._client.cancel(list(pending), force=True)
-            raise
-
-    def completed(self, pending: Sequence[Any]) -> Iterator[tuple[int, Outcome | Exception]]:
-        """Wait for the tasks as they end."""
-        if not pending:
-            return
-        places = {future.key: index for index, future in enumerate(pending)}
-
-        def outcome(future: Any) -> Outcome:
-            with self._explained():
-                return cast("Outcome", future.result())
-
-        for future in self._distributed.as_completed(pending):
-            yield places[future.key], _caught(lambda future=future: outcome(future))  # type: ignore[misc]
-
-    def run_everywhere(self, function: Callable[[], Any]) -> list[Any]:
-        """Return what a function returns on every worker."""
-        with self._explained():
-            return list(self._client.run(function).values())
-
-    def close(self) -> None:
-        """Leave a running cluster, or end our own."""
-        # A client that lost its scheduler says so at length when it stops looking for it.
-        logger = logging.getLogger("distributed.client")
-        level = logger.level
-        logger.setLevel(logging.CRITICAL)
-        with suppress(Exception):
-            self._client.close(timeout=5)
-        logger.setLevel(level)
-        if self._cluster is not None:
-            with suppress(Exception):
-                self._cluster.close(timeout=10)
-
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Turn what Dask raises about workers and connections into our error."""
-        from asyncio import CancelledError as Cancelled
-
-        lost = (
-            CancelledError,
-            Cancelled,
-            self._distributed.comm.CommClosedError,
-            self._distributed.client.FutureCancelledError,
-        )
-        try:
-            yield
-        except self._distributed.KilledWorker as error:
-            raise ClusterError(f"a task ended its workers again and again, for want of memory most likely; {LOST}") from error
-        except lost as error:
-            raise ClusterError(f"the connection to the scheduler at {self.name} was lost; {LOST}") from error
+def _pool(workers: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_obey_parent)
 
 
-def _caught(function: Callable[[], Outcome]) -> Outcome | Exception:
-    """Return what a function returns, or the exception that it raises."""
+def _obey_parent() -> None:
+    """Leave Ctrl-C to the parent, which ends this process by SIGTERM."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+
+
+def _run_here(function: Callable[..., Any], settings: Settings, *arguments: Any) -> Outcome:
+    """Run a task in a process of a pool; SIGTERM unwinds it, so that what is half done is dropped, and ends the process."""
     try:
-        return function()
-    except Exception as error:
-        return error
-
-
-_numbers = itertools.count()
-
-
-def _key(function: Callable[..., Any]) -> str:
-    """Return a name for a task, which Dask's dashboard groups by what stands before the number."""
-    return f"{function.__name__.strip('_')}-{time.time_ns():x}{next(_numbers):x}"
+        return run_task(function, settings, *arguments)
+    except SystemExit as end:
+        os._exit(int(end.code or 0))  # the pool would take it for a result and start the next task
 
 
 def open_engine(scheduler: str, jobs: int | None = None, retries: int = DEFAULT_RETRIES) -> Engine:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import time
 import warnings
@@ -10,7 +11,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsplat_tools.errors import GsplatWarning, ReadError, WriteError
+from gsplat_tools.formats._store_requests import store_timeout, use_store_timeout
 from gsplat_tools.parallel import use_jobs
+
+DEFAULT_RETRIES = 3
+"""Times that a task is tried again after an error that may pass, or after its worker died."""
 
 # Tasks use all the threads they are given by themselves, and the list of warnings is one for all threads of a process.
 _alone = threading.Lock()
@@ -24,6 +29,8 @@ class Outcome:
     error: Exception | None = None
     warnings: list[GsplatWarning] = field(default_factory=list)
     seconds: float = 0.0
+    full: tuple[str, str] | None = None
+    """Where the disk of a worker was full: its address, and the key of the task that met it."""
 
     def result(self) -> Any:
         """Return the value, or raise the error."""
@@ -39,11 +46,37 @@ def is_passing(error: BaseException) -> bool:
     )
 
 
-def run_task(function: Callable[..., Any], jobs: int | None, *arguments: Any) -> Outcome:
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What a task takes over from the process that hands it in.
+
+    Parameters
+    ----------
+    jobs
+        Threads; None leaves it to the machine.
+    store_timeout
+        As `use_store_timeout` takes it.
+    """
+
+    jobs: int | None
+    store_timeout: float = field(default_factory=store_timeout)
+
+
+def is_full(error: BaseException | None) -> bool:
+    """Whether an error came from a disk without space, which it stays for as long as the task's worker is the same."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__
+    return False
+
+
+def run_task(function: Callable[..., Any], settings: Settings, *arguments: Any) -> Outcome:
     """Run a task; errors that may pass are raised, so that the engine tries again, others are returned."""
     given = [each.result() if isinstance(each, Outcome) else each for each in arguments]
     start = time.perf_counter()
-    with _alone, use_jobs(jobs), warnings.catch_warnings(record=True) as caught:
+    within = use_store_timeout(settings.store_timeout)
+    with _alone, use_jobs(settings.jobs), within, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", GsplatWarning)
         outcome = Outcome()
         try:
@@ -65,3 +98,11 @@ def warn_again(outcomes: list[Outcome]) -> None:
             if (warning.code, str(warning)) not in seen:
                 seen.add((warning.code, str(warning)))
                 warnings.warn(warning, stacklevel=3)
+
+
+def caught(function: Callable[[], Outcome]) -> Outcome | Exception:
+    """Return what a function returns, or the exception that it raises."""
+    try:
+        return function()
+    except Exception as error:
+        return error

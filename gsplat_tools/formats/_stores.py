@@ -10,9 +10,10 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO
 
-from gsplat_tools.errors import GsplatError, MissingDependencyError, ReadError, TargetExistsError, WriteError
+from gsplat_tools.errors import GsplatError, ReadError, TargetExistsError, WriteError
+from gsplat_tools.formats._store_requests import ask, fetch, file_system, in_words
 
 BLOCK_BYTES = 8 << 20
 """Bytes of a range that is read, and of a part that is written: a store takes 10,000 parts, and none below 5 MiB."""
@@ -21,10 +22,6 @@ LARGE_BLOCK_BYTES = 64 << 20
 """The same for targets whose size is not known: up to 640 GB."""
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(?=[^/]|$)(.*)", re.DOTALL)
-_EXTRAS = {"s3": "s3fs (pip install 'gsplat_tools[s3]')", "gs": "gcsfs (pip install 'gsplat_tools[gs]')"}
-
-# s3fs tries again by itself, for half a minute; the SDK below it, for connections that are refused or time out.
-_TIMEOUTS = {"connect_timeout": 10, "read_timeout": 30, "retries": {"max_attempts": 5, "mode": "standard"}}
 
 
 def is_url(path: str | Path) -> bool:
@@ -49,52 +46,30 @@ def _text(path: str | Path) -> str:
     return path if isinstance(path, str) else path.as_posix()
 
 
-def file_system(url: str) -> tuple[Any, str]:
-    """Return the file system of a URL and the path in it.
-
-    Raises
-    ------
-    MissingDependencyError
-        fsspec, or what it needs for this store, is not installed.
-    """
-    scheme = url.partition(":")[0]
-    try:
-        import fsspec
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{scheme}:// needs fsspec; install it with pip install 'gsplat_tools[cluster]'"
-        ) from error
-    options: dict[str, Any] = {}
-    if scheme in ("s3", "s3a"):
-        options = {"config_kwargs": _TIMEOUTS, "default_block_size": BLOCK_BYTES}
-    try:
-        found = fsspec.core.url_to_fs(url, **options)
-    except ImportError as error:
-        raise MissingDependencyError(f"{scheme}:// needs {_EXTRAS.get(scheme, 'its fsspec package')}: {error}") from error
-    except ValueError as error:
-        raise ReadError(f"no store is known for {scheme}://; {error}", path=url) from error
-    return cast("tuple[Any, str]", found)
-
-
 @contextmanager
 def _explained(url: str, kind: type[ReadError] | type[WriteError]) -> Iterator[None]:
     """Turn whatever a store or its library raises into an error that names the object."""
     try:
         yield
-    except (GsplatError, FileNotFoundError):
+    except GsplatError:
         raise
     except Exception as error:
-        said = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, FileNotFoundError) and kind is ReadError:
+            raise
         verb = "read from" if kind is ReadError else "write to"
-        raise kind(f"cannot {verb} the store: {said}; try again, or check its address and credentials", path=url) from error
+        raise kind(f"cannot {verb} the store: {in_words(error)}", path=url) from error
 
 
 class _Object(io.RawIOBase):
     """An object open for reading, by ranges; errors name it."""
 
-    def __init__(self, url: str, stream: Any) -> None:
+    def __init__(self, url: str, system: Any, path: str) -> None:
         self.name = url
-        self._stream = stream
+        self._system, self._path = system, path
+        self._info = ask(system, "info", path)
+        self._size = int(self._info["size"])
+        self._position = self._start = 0
+        self._block = b""
 
     def readable(self) -> bool:
         return True
@@ -103,21 +78,30 @@ class _Object(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        return int(self._stream.seek(offset, whence))
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
+        self._position = max(0, start + offset)
+        return self._position
 
     def tell(self) -> int:
-        return int(self._stream.tell())
+        return self._position
 
     def readinto(self, buffer: Any, /) -> int:
         view = memoryview(buffer).cast("B")
-        with _explained(self.name, ReadError):
-            data = self._stream.read(len(view))
+        if not len(view) or self._position >= self._size:
+            return 0
+        offset = self._position - self._start
+        if not 0 <= offset < len(self._block):
+            end = min(self._position + BLOCK_BYTES, self._size)
+            with _explained(self.name, ReadError):
+                self._block = fetch(self._system, self._path, self._position, end, self._info)
+            self._start, offset = self._position, 0
+        data = self._block[offset : offset + len(view)]
         view[: len(data)] = data
+        self._position += len(data)
         return len(data)
 
     def close(self) -> None:
-        if not self.closed:
-            self._stream.close()
+        self._block = b""
         super().close()
 
 
@@ -134,11 +118,12 @@ def open_object(path: str | Path) -> BinaryIO:
     url = url_of(path)
     with _explained(url, ReadError):
         system, name = file_system(url)
+        system.invalidate_cache(name.rpartition("/")[0])
         try:
-            stream = system.open(name, "rb", block_size=BLOCK_BYTES, cache_type="readahead")
+            stream = _Object(url, system, name)
         except FileNotFoundError as error:
             raise FileNotFoundError(2, "there is no such object", url) from error
-    return io.BufferedReader(_Object(url, stream), 1 << 18)
+    return io.BufferedReader(stream, 1 << 18)
 
 
 def identity(path: str | Path) -> str:
@@ -158,7 +143,7 @@ def identity(path: str | Path) -> str:
     with _explained(url, ReadError):
         system, name = file_system(url)
         system.invalidate_cache(name.rpartition("/")[0])
-        info = system.info(name)
+        info = ask(system, "info", name)
     tag = next((info[key] for key in ("ETag", "etag", "mtime", "LastModified", "created") if info.get(key)), "")
     return f"{info['size']} {tag}"
 
@@ -171,7 +156,10 @@ def exists(path: str | Path) -> bool:
     with _explained(url, ReadError):
         system, name = file_system(url)
         system.invalidate_cache(name.rpartition("/")[0])
-        return bool(system.exists(name))
+        with suppress(FileNotFoundError):
+            ask(system, "info", name)
+            return True
+    return False
 
 
 def matching(pattern: str | Path) -> list[str]:
@@ -180,7 +168,7 @@ def matching(pattern: str | Path) -> list[str]:
     with _explained(url, ReadError):
         system, name = file_system(url)
         system.invalidate_cache()
-        found = system.glob(f"{name.rstrip('/')}/*" if url.endswith("/") else name, detail=True)
+        found = ask(system, "glob", f"{name.rstrip('/')}/*" if url.endswith("/") else name, detail=True, is_slow=True)
     return [str(system.unstrip_protocol(each)) for each, info in found.items() if info["type"] == "file"]
 
 
@@ -219,14 +207,32 @@ class ObjectWriter(io.RawIOBase):
         """
         with _explained(self.name, WriteError):
             self._stream.close()
-            if not overwrite and exists(self.name):
+            before = self._published()
+            if before is not None and not overwrite:
                 raise TargetExistsError("the target appeared while it was being made; it is left as it is", path=self.name)
-            self._stream.commit()
-            self._system.invalidate_cache(self._path.rpartition("/")[0])
-            size = self._system.info(self._path)["size"]
-        if size != self.written:
-            raise WriteError(f"{self.written} bytes were sent and the store holds {size}; convert again", path=self.name)
+            try:
+                self._stream.commit()
+            except Exception:
+                # The answer may have been lost on its way after the store had done it all.
+                with suppress(Exception):
+                    found = self._published(tries=1)
+                    if found is not None and found != before and found["size"] == self.written:
+                        super().close()
+                        return
+                raise
+            found = self._published() or {"size": 0}
+        if found["size"] != self.written:
+            raise WriteError(
+                f"{self.written} bytes were sent and the store holds {found['size']}; convert again", path=self.name
+            )
         super().close()
+
+    def _published(self, tries: int | None = None) -> dict[str, Any] | None:
+        """Return what the store says about the object, None where there is none."""
+        self._system.invalidate_cache(self._path.rpartition("/")[0])
+        with suppress(FileNotFoundError):
+            return dict(ask(self._system, "info", self._path, tries=tries))
+        return None
 
     def discard(self) -> None:
         """Give up: the parts that were sent are dropped, as far as the store can be reached."""
@@ -296,4 +302,4 @@ def remove(path: str | Path) -> None:
         system, name = file_system(url)
         system.invalidate_cache()
         with suppress(FileNotFoundError):
-            system.rm(name, recursive=True)
+            ask(system, "rm", name, recursive=True, is_slow=True)

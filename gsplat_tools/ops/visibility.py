@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,6 +134,19 @@ def tolerance_from_json(value: Any) -> Tolerance | None:
     return Tolerance(pixels, Viewpoint((x, y, z), radius))
 
 
+_given: ContextVar[Viewpoint | None] = ContextVar("gsplat_tools_viewpoint", default=None)
+
+
+@contextmanager
+def use_viewpoint(view: Viewpoint | None) -> Iterator[None]:
+    """Look at every scene from here inside the block: a part of a scene is to be seen as the whole is. None changes nothing."""
+    token = _given.set(_given.get() if view is None else view)
+    try:
+        yield
+    finally:
+        _given.reset(token)
+
+
 def viewpoint(cloud: GaussianCloud) -> Viewpoint:
     """Return from where a scene is looked at; see `viewpoint_of`."""
     return viewpoint_of([cloud], len(cloud))
@@ -155,6 +170,9 @@ def viewpoint_of(pieces: Iterable[GaussianCloud], count: int) -> Viewpoint:
     """
     from gsplat_tools.attributes.activations import sigmoid
 
+    given = _given.get()
+    if given is not None:
+        return given
     step = max(1, -(-count // _MAX_SAMPLES))
     samples, passed = list[tuple[NDArray[np.float32], ...]](), 0
     for piece in pieces:

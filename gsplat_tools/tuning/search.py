@@ -12,6 +12,7 @@ from gsplat_tools.errors import ValidationError
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.knobs import Knob
 from gsplat_tools.formats.saving import DEFAULT_PRESET
+from gsplat_tools.ops.visibility import viewpoint
 from gsplat_tools.progress import report_to, stage
 from gsplat_tools.remembering import remembering
 from gsplat_tools.sequence import GaussianSequence
@@ -112,7 +113,9 @@ class Searcher:
             pinned.setdefault("prune_faint", 0.0)  # which a visual tolerance would set
         self.whole = Trials(Workbench(scene, views=views, size=size, model=model), record, preset, pinned)
         half = max(size[0] // 2, 1), max(size[1] // 2, 1)
-        self._part = Trials(Workbench(_part(scene), views=views, size=half, model=model), record, preset, pinned)
+        part = _part(scene)
+        view = viewpoint(scene) if isinstance(scene, GaussianCloud) and part is not scene else None
+        self._part = Trials(Workbench(part, views=views, size=half, model=model), record, preset, pinned, view)
         self._rates: dict[bool, RateModel] = {}
         self.is_large = _count(scene) > LARGE
 

@@ -17,6 +17,7 @@ from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.loading import open_scene
 from gsplat_tools.formats.preparing import Prepared, prepare
 from gsplat_tools.formats.saving import count_splats, save, split_options
+from gsplat_tools.ops.visibility import Viewpoint, use_viewpoint
 from gsplat_tools.tuning.measuring import Workbench, cloud_of, drawn_frames
 
 Errors = NDArray[np.float64]
@@ -62,10 +63,14 @@ class Trials:
         The format.
     preset, fixed
         What holds for every trial.
+    view
+        From where the scene is looked at to tell what hardly shows; by default from where it looks best.
     """
 
-    def __init__(self, bench: Workbench, record: Format, preset: str, fixed: Mapping[str, Any]) -> None:
-        self.bench, self.record, self.preset, self.fixed = bench, record, preset, dict(fixed)
+    def __init__(
+        self, bench: Workbench, record: Format, preset: str, fixed: Mapping[str, Any], view: Viewpoint | None = None
+    ) -> None:
+        self.bench, self.record, self.preset, self.fixed, self._view = bench, record, preset, dict(fixed), view
         self._known: dict[tuple[Any, ...], Trial] = {}
 
     @property
@@ -114,7 +119,7 @@ class Trials:
         key = (*sorted(options.items()), ("prepared", True))
         if key not in self._known:
             choices, _ = split_options(self.record, self.preset, {**self.fixed, **options})
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), use_viewpoint(self._view):
                 warnings.simplefilter("ignore")
                 prepared = prepare(self.bench.scene, self.record, choices).scene
             frames = _frames(prepared)
@@ -127,7 +132,7 @@ class Trials:
         def remember(_stream: BinaryIO, prepared: Prepared, _record: Format) -> None:
             given.append(prepared.scene)
 
-        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), use_viewpoint(self._view):
             warnings.simplefilter("ignore")
             path = Path(folder) / f"trial{self.record.extensions[0]}"
             report = save(self.bench.scene, path, to=self.record.id, preset=self.preset, check=remember, **options)

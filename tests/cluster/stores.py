@@ -1,4 +1,4 @@
-"""An S3 server on loopback, and a proxy before it that fails on demand."""
+"""An S3 server on loopback, and a proxy before it that fails or hangs on demand."""
 
 from __future__ import annotations
 
@@ -9,13 +9,28 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+from gsplat_tools.formats import _store_requests
 
 BUCKET = "bucket"
 
 Fault = Callable[[str, str, int], str | None]
-"""Method, path and number of the request, from 0, to "503", "hang", "cut" or None."""
+"""Method, path and number of the request, from 0, to None or what goes wrong:
+
+503         the store is busy
+cut         the connection ends without an answer
+hang        the request is taken and never answered
+deaf        not even the body of the request is taken
+stall       the answer ends in the middle of its body, and the connection stays open
+drip        the body of the answer comes a byte at a time, `DRIP` seconds apart
+late        the request is carried out, and never answered
+"""
+
+DRIP = 0.2
+LONGEST = 120.0
+"""Seconds that a request hangs if nobody gives it up."""
 
 
 class Proxy:
@@ -26,6 +41,8 @@ class Proxy:
         self.count = 0
         self.failed = 0
         self.log: list[tuple[str, str]] = []
+        self.ranges: list[str] = []
+        self.released = threading.Event()
         lock = threading.Lock()
         proxy = self
 
@@ -41,14 +58,19 @@ class Proxy:
                     proxy.log.append((self.command, self.path))
                     fault = proxy.fault(self.command, self.path, number) if proxy.fault else None
                     proxy.failed += fault is not None
+                    proxy.ranges.append(self.headers.get("Range") or "")
                 size = int(self.headers.get("Content-Length") or 0)
-                if fault == "cut":
-                    self.connection.close()
+                if fault in ("cut", "deaf"):
+                    if fault == "deaf":
+                        proxy.hang(self.connection)
+                    self.close_connection = True
+                    with suppress(OSError):
+                        self.connection.shutdown(socket.SHUT_RDWR)
                     return
                 body = self._body(size)
                 if fault == "hang":
-                    time.sleep(60)
-                    self.connection.close()
+                    proxy.hang(self.connection)
+                    self.close_connection = True
                     return
                 if fault == "503":
                     text = b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"
@@ -65,6 +87,10 @@ class Proxy:
                 connection.request(self.command, self.path, body, headers)
                 answer = connection.getresponse()
                 data = answer.read()
+                if fault == "late":
+                    proxy.hang(self.connection)
+                    self.close_connection = True
+                    return
                 self.send_response(answer.status)
                 for name, value in answer.getheaders():
                     if name.lower() not in ("transfer-encoding", "connection", "content-length", "server", "date"):
@@ -72,9 +98,18 @@ class Proxy:
                 length = answer.getheader("Content-Length") if self.command == "HEAD" else str(len(data))
                 self.send_header("Content-Length", length or "0")
                 self.end_headers()
-                if self.command != "HEAD":
-                    self.wfile.write(data)
                 connection.close()
+                if fault in ("stall", "drip"):
+                    self.close_connection = True
+                    self.wfile.write(data[: len(data) // 2])
+                    self.wfile.flush()
+                    if fault == "stall":
+                        proxy.hang(self.connection)
+                    for byte in data[len(data) // 2 :] if fault == "drip" else b"":
+                        proxy.released.wait(DRIP)
+                        self.wfile.write(bytes([byte]))
+                elif self.command != "HEAD":
+                    self.wfile.write(data)
 
             def _body(self, size: int) -> bytes:
                 if (self.headers.get("Transfer-Encoding") or "").lower() != "chunked":
@@ -100,7 +135,25 @@ class Proxy:
         self.url = f"http://127.0.0.1:{self._server.server_port}"
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
+    def hang(self, connection: socket.socket) -> None:
+        """Wait until the other side gives up, or the proxy ends."""
+        end = time.monotonic() + LONGEST
+        while time.monotonic() < end and not self.released.wait(0.05):
+            try:
+                if not connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
+                    return
+            except BlockingIOError:
+                continue
+            except OSError:
+                return
+
+    def reset(self, fault: Fault | None = None) -> None:
+        """Forget what happened, and fail like this from now on."""
+        self.fault, self.count, self.failed = fault, 0, 0
+        self.log, self.ranges = [], []
+
     def close(self) -> None:
+        self.released.set()
         self._server.shutdown()
         self._server.server_close()
 
@@ -109,6 +162,7 @@ class Proxy:
 def s3_server() -> Iterator[Proxy]:
     """An empty bucket, for this process and its children; yields the proxy that stands before it."""
     import fsspec
+    import requests
     from moto.server import ThreadedMotoServer
 
     logging.getLogger("werkzeug").setLevel(logging.CRITICAL)
@@ -130,11 +184,12 @@ def s3_server() -> Iterator[Proxy]:
     before = {name: os.environ.get(name) for name in own}
     os.environ.update(own)
     try:
-        _forget()
+        forget()
+        requests.post(f"{proxy.direct}/moto-api/reset", timeout=10)  # servers of one process share what they hold
         fsspec.filesystem("s3").mkdir(BUCKET)
         yield proxy
     finally:
-        _forget()
+        forget()
         proxy.close()
         server.stop()
         for name, value in before.items():
@@ -144,10 +199,10 @@ def s3_server() -> Iterator[Proxy]:
                 os.environ[name] = value
 
 
-def _forget() -> None:
+def forget() -> None:
     """Let go of connections to an earlier server."""
     import fsspec
-    import s3fs
 
-    s3fs.S3FileSystem.clear_instance_cache()
+    for kind in (fsspec.get_filesystem_class("s3"), _store_requests._s3()):
+        kind.clear_instance_cache()
     fsspec.config.conf.clear()

@@ -14,7 +14,7 @@ from gsplat_tools.cluster.engines import InProcess
 from gsplat_tools.cluster.sequences import convert_sequence
 from gsplat_tools.convert import convert
 from gsplat_tools.errors import CapabilityError, ReadError, TargetExistsError, WriteError
-from gsplat_tools.formats import _stores, load
+from gsplat_tools.formats import _store_requests, _stores, load
 from gsplat_tools.formats._stores import is_url, local_path, replacing_object, url_of
 from gsplat_tools.formats.loading import inspect_file
 from gsplat_tools.formats.saving import save
@@ -38,13 +38,14 @@ def memory() -> Iterator[Any]:
 def s3() -> Iterator[Proxy]:
     pytest.importorskip("moto")
     with s3_server() as proxy, pytest.MonkeyPatch.context() as patch:
-        patch.setitem(_stores._TIMEOUTS, "retries", {"max_attempts": 1})  # s3fs tries again by itself
+        patch.setattr(_store_requests, "_FIRST_PAUSE", 0.01)
         yield proxy
 
 
 @pytest.fixture
 def store(s3: Proxy) -> Iterator[Proxy]:
     """The server, without faults and objects at first, its errors given up soon."""
+    s3.reset()
     yield s3
     s3.fault = None
     system = fsspec.filesystem("s3")
@@ -125,27 +126,19 @@ def test_a_header__is_read_without_the_rest(store: Proxy) -> None:
     save(random_cloud(120_000, sh_degree=3), "s3://bucket/large.ply")
     size = system.info(f"{BUCKET}/large.ply")["size"]
     assert size > 2 * _stores.BLOCK_BYTES
-    ranges: list[str] = []
-    get = system._call_s3
+    store.reset()
 
-    async def noted(method: str, *args: Any, **kwargs: Any) -> Any:
-        if method == "get_object":
-            ranges.append(kwargs.get("Range", "all"))
-        return await get(method, *args, **kwargs)
-
-    system._call_s3 = noted
-    try:
-        info = inspect_file("s3://bucket/large.ply")[1]
-    finally:
-        del system._call_s3
+    info = inspect_file("s3://bucket/large.ply")[1]
 
     assert info.splats == 120_000
-    starts_ends = [tuple(map(int, each.removeprefix("bytes=").split("-"))) for each in ranges]
-    assert sum(end - start + 1 for start, end in starts_ends) < size
+    read = [
+        each for (method, path), each in zip(store.log, store.ranges, strict=True) if (method, "large" in path) == ("GET", True)
+    ]
+    starts_ends = [tuple(map(int, each.removeprefix("bytes=").split("-"))) for each in read]
+    assert 0 < sum(end - start + 1 for start, end in starts_ends) < size
 
 
 def test_an_upload_that_is_cut_off__leaves_the_object_as_it_was(store: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s3fs.core.S3FileSystem.retries", 2)
     with replacing_object("s3://bucket/x", overwrite=True) as stream:
         stream.write(b"before")
 
@@ -181,12 +174,35 @@ def test_a_store_that_is_busy_now_and_then__changes_no_byte(store: Proxy, tmp_pa
 
 
 def test_a_store_that_stays_busy__is_an_error_that_names_it(store: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s3fs.core.S3FileSystem.retries", 2)
     save(random_cloud(20), "s3://bucket/a.ply")
     store.fault = lambda _method, _path, _number: "503"
 
     with pytest.raises(ReadError, match=r"s3://bucket/a\.ply: cannot read from the store"):
         load("s3://bucket/a.ply")
+
+
+def test_an_object_that_is_replaced_while_it_is_read__is_an_error(store: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_stores, "BLOCK_BYTES", 1 << 19)
+    system = fsspec.filesystem("s3")
+    system.pipe_file(f"{BUCKET}/x", bytes(3 << 20))
+    with _stores.open_object("s3://bucket/x") as stream:
+        assert stream.read(1 << 18) == bytes(1 << 18)
+        system.pipe_file(f"{BUCKET}/x", bytes(reversed(range(256))) * (3 << 12))
+        with pytest.raises(ReadError, match=r"s3://bucket/x: the object was replaced"):
+            stream.read()
+
+
+def test_reads_here_and_there__give_the_bytes_that_are_there(memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_stores, "BLOCK_BYTES", 1000)
+    data = np.random.default_rng(1).bytes(400_000)
+    memory.pipe_file("/b/x", data)
+    with _stores.open_object("memory://b/x") as stream:
+        for start in (0, 390_000, 5, 263_000, 399_999, 400_000, 500_000, 17):
+            for size in (1, 999, 1001, 70_000):
+                assert stream.seek(start) == start
+                assert stream.read(size) == data[start : start + size]
+        assert stream.seek(-3, 2) == 399_997
+        assert stream.read() == data[-3:]
 
 
 def test_a_scene_in_blocks_in_s3__has_the_bytes_of_one_on_the_disk(store: Proxy, tmp_path: Path) -> None:

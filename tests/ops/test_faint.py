@@ -13,7 +13,7 @@ from gsplat_tools.convert import convert
 from gsplat_tools.errors import CapabilityError
 from gsplat_tools.ops import visibility
 from gsplat_tools.ops.filtering import prune_faint
-from gsplat_tools.ops.visibility import Viewpoint, faint_pixels, lit_pixels, viewpoint, viewpoint_of
+from gsplat_tools.ops.visibility import Viewpoint, faint_pixels, lit_pixels, use_viewpoint, viewpoint, viewpoint_of
 from gsplat_tools.sequence import GaussianSequence
 from tests.clouds import random_cloud
 
@@ -60,6 +60,14 @@ def test_viewpoint__is_the_same_of_pieces(scene: GaussianCloud, size: int, monke
     monkeypatch.setattr(visibility, "_MAX_SAMPLES", 100)
 
     assert viewpoint_of(as_chunks(scene, size), len(scene)) == viewpoint(scene)
+
+
+def test_viewpoint__is_that_of_the_whole_where_a_part_stands_for_it(scene: GaussianCloud) -> None:
+    part, whole = scene.take(slice(0, 50)), viewpoint(scene)
+
+    with use_viewpoint(whole), use_viewpoint(None):
+        assert viewpoint(part) == whole
+    assert viewpoint(part) != whole
 
 
 def test_viewpoint__of_nothing_is_somewhere() -> None:

@@ -26,7 +26,7 @@ from gsplat_tools.cluster.sequences import convert_sequence
 from gsplat_tools.errors import GsplatError
 from gsplat_tools.formats._stores import exists, is_url
 from tests.cluster.sequences import killing, local_bundle, make_frames, parts_of, sha256
-from tests.cluster.stores import BUCKET, s3_server
+from tests.cluster.stores import BUCKET, forget, s3_server
 
 OPTIONS: dict[str, Any] = {"delta_segment_length": 8}
 
@@ -237,7 +237,7 @@ def on_s3(cases: Cases, folder: Path) -> None:
         target = f"s3://{BUCKET}/killed/out.sog4d"
         cases.case("S3, local-cluster:2, a worker killed", "local-cluster:2", pattern, target, kill(target))
         os.environ["AWS_ENDPOINT_URL"] = proxy.url
-        fsspec.get_filesystem_class("s3").clear_instance_cache()
+        forget()
         faults = {
             "every 20th request 503, every 33rd cut": lambda _m, _p, n: (
                 "503" if n % 20 == 9 else "cut" if n % 33 == 9 else None
@@ -261,11 +261,18 @@ def on_s3(cases: Cases, folder: Path) -> None:
         cases.tell("S3, local:1, the store refuses the target with 503", target, words, start)
 
 
+def on_hanging(cases: Cases, folder: Path) -> None:
+    """Stores that do not answer, as commands see them."""
+    from tests.reliability.hanging_stores import try_everything
+
+    try_everything(cases.pattern, cases.expected, folder, OPTIONS["delta_segment_length"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--splats", type=int, default=300)
-    parser.add_argument("--only", choices=["files", "schedulers", "s3"])
+    parser.add_argument("--only", choices=["files", "schedulers", "s3", "hanging"])
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -275,7 +282,7 @@ def main() -> None:
         print(f"{arguments.frames} frames of {arguments.splats} splats; one machine: {expected}")
         print(f"{'one machine, files':<58} {'':<10}  {time.perf_counter() - start:6.1f} s", flush=True)
         cases = Cases(pattern, expected, arguments.frames)
-        for part, test in (("files", on_files), ("schedulers", on_schedulers), ("s3", on_s3)):
+        for part, test in (("files", on_files), ("schedulers", on_schedulers), ("s3", on_s3), ("hanging", on_hanging)):
             if arguments.only in (None, part):
                 test(cases, folder)
 

@@ -1,0 +1,209 @@
+"""Tasks on Dask: a cluster of this machine, or one that is running."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
+from typing import Any, cast
+
+from gsplat_tools.cluster.outcomes import DEFAULT_RETRIES, Outcome, Settings, caught, is_full, run_task
+from gsplat_tools.errors import ClusterError, MissingDependencyError
+from gsplat_tools.parallel import num_jobs
+
+LOST = "the same command continues: segments and scenes that are finished are kept"
+
+_FULL_SECONDS = 2.0
+"""Seconds that a worker with a full disk takes to say so, lest it be the first that is free for every task."""
+
+_LOOK_SECONDS = 5.0
+"""Seconds between two looks whether workers that a task is kept to are still there."""
+
+
+class Dask:
+    """Runs tasks on Dask: a cluster of this machine, or one that is running."""
+
+    def __init__(self, address: str, jobs: int | None = None, retries: int = DEFAULT_RETRIES) -> None:
+        try:
+            import distributed as imported
+        except ImportError as error:
+            raise MissingDependencyError(
+                "a cluster needs dask.distributed; install it with pip install 'gsplat_tools[cluster]'"
+            ) from error
+        self._cluster: Any = None
+        distributed: Any = imported
+        self._distributed = distributed
+        self._retries = retries
+        self.name = address
+        self.retried = 0
+        self._full: set[str] = set()
+        self._given: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
+        self._instead: dict[str, Any] = {}
+        self._kept_to: dict[str, list[str]] = {}
+        local = re.fullmatch(r"local-cluster:(\d+)", address)
+        try:
+            if local:
+                count = int(local[1])
+                jobs = jobs or max(1, num_jobs() // count)
+                self._cluster = distributed.LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs="CRITICAL",
+                )
+            self._client = distributed.Client(self._cluster or address, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=60)
+        except (OSError, TimeoutError) as error:
+            raise ClusterError(f"no scheduler answers at {address}, or it has no workers: {error}") from error
+        self._settings = Settings(jobs)
+        self.workers = len(self._addresses())
+        self.dashboard = self._client.dashboard_link
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Hand in a task."""
+        future = self._submit(function, arguments)
+        self._given[future.key] = (function, arguments)
+        return future
+
+    def results(self, pending: Sequence[Any]) -> Iterator[Outcome]:
+        """Wait for the tasks; where one fails, those that are not finished are given up."""
+        try:
+            for future in pending:
+                yield self._outcome(future)
+        except BaseException:
+            with suppress(Exception):
+                self._client.cancel(list(pending), force=True)
+            raise
+
+    def completed(self, pending: Sequence[Any]) -> Iterator[tuple[int, Outcome | Exception]]:
+        """Wait for the tasks as they end."""
+        if not pending:
+            return
+        places = {future.key: index for index, future in enumerate(pending)}
+        with self._client.as_current():
+            ended = self._distributed.as_completed(pending)
+        for future in ended:
+            yield places[future.key], caught(lambda future=future: self._outcome(future))  # type: ignore[misc]
+
+    def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        # Not `allow_other_workers`: workers whose disk is full are idle, and would steal what is kept from them.
+        workers = [each for each in self._addresses() if each not in self._full] if self._full else None
+        with self._explained():
+            future = self._client.submit(
+                _run_on_worker, function, self._settings, *arguments,
+                retries=self._retries, pure=False, key=_key(function), workers=workers,
+            )  # fmt: skip
+        if workers:
+            self._kept_to[future.key] = workers
+        return future
+
+    def _outcome(self, future: Any) -> Outcome:
+        """Wait for a task; where it met a full disk, other workers do it."""
+        given = self._given.pop(future.key, None)
+        future = self._instead.get(future.key, future)
+        while (outcome := self._waited(future)) is None or outcome.full is not None:
+            if outcome is not None:
+                assert outcome.full is not None
+                address, key = outcome.full
+                self._full.add(address)
+                self.retried += 1
+                if given is None or self._full.issuperset(self._addresses()):
+                    assert outcome.error is not None
+                    raise outcome.error
+                arguments = tuple(self._again(each) if getattr(each, "key", "") == key else each for each in given[1])
+                given = (given[0], arguments)
+            assert given is not None
+            future = self._submit(*given)
+        for each in given[1] if given is not None else ():  # what they were made from may go
+            self._given.pop(getattr(each, "key", ""), None)
+        return outcome
+
+    def _again(self, future: Any) -> Any:
+        """Hand in again what another task needs, once for all that need it."""
+        if future.key not in self._instead:
+            function, arguments = self._given[future.key]
+            self._instead[future.key] = self.submit(function, *arguments)
+        return self._instead[future.key]
+
+    def _waited(self, future: Any) -> Outcome | None:
+        """Wait for a task, or until no worker is left of those that it was kept to."""
+        kept_to = self._kept_to.pop(future.key, None)
+        if kept_to:
+            done = threading.Event()
+            future.add_done_callback(lambda _: done.set())
+            while not done.wait(_LOOK_SECONDS):
+                if not set(kept_to) & set(self._addresses()):
+                    return None
+        with self._explained():
+            return cast("Outcome", future.result())
+
+    def _addresses(self) -> list[str]:
+        with self._explained():
+            return list(self._client.scheduler_info(n_workers=-1)["workers"])
+
+    def run_everywhere(self, function: Callable[[], Any]) -> list[Any]:
+        """Return what a function returns on every worker."""
+        with self._explained():
+            return list(self._client.run(function).values())
+
+    def close(self) -> None:
+        """Leave a running cluster, or end our own."""
+        # A client that lost its scheduler says so at length when it stops looking for it.
+        logger = logging.getLogger("distributed.client")
+        level = logger.level
+        logger.setLevel(logging.CRITICAL)
+        with suppress(Exception):
+            self._client.close(timeout=5)
+        logger.setLevel(level)
+        if self._cluster is not None:
+            with suppress(Exception):
+                self._cluster.close(timeout=10)
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Turn what Dask raises about workers and connections into our error."""
+        from asyncio import CancelledError as Cancelled
+
+        lost = (
+            CancelledError,
+            Cancelled,
+            self._distributed.comm.CommClosedError,
+            self._distributed.client.FutureCancelledError,
+        )
+        try:
+            yield
+        except self._distributed.KilledWorker as error:
+            raise ClusterError(f"a task ended its workers again and again, for want of memory most likely; {LOST}") from error
+        except lost as error:
+            raise ClusterError(f"the connection to the scheduler at {self.name} was lost; {LOST}") from error
+
+
+def _run_on_worker(function: Callable[..., Any], settings: Settings, *arguments: Any) -> Outcome:
+    """Run a task on a Dask worker; a full disk is told to the engine, since trying again here would use up the tries."""
+    for each in arguments:
+        if isinstance(each, Outcome) and each.full is not None:
+            return each
+    try:
+        return run_task(function, settings, *arguments)
+    except Exception as error:
+        if not is_full(error):
+            raise
+        from distributed import get_worker
+
+        time.sleep(_FULL_SECONDS)
+        worker: Any = get_worker()
+        return Outcome(error=error, full=(worker.address, worker.get_current_task()))
+
+
+_numbers = itertools.count()
+
+
+def _key(function: Callable[..., Any]) -> str:
+    """Return a name for a task, which Dask's dashboard groups by what stands before the number."""
+    return f"{function.__name__.strip('_')}-{time.time_ns():x}{next(_numbers):x}"
