@@ -28,7 +28,7 @@ LOCAL = "local"
 
 _OF_THE_COMMAND = (
     "batch", "state", "resume", "scheduler", "retries", "parts", "jobs", "max_memory", "as_json", "quiet", "progress",
-    "store_timeout", "dry_run", "version", "help", "show_knobs",
+    "store_timeout", "dry_run", "version", "help", "show_knobs", "block_splats",
 )  # fmt: skip
 """Parameters that a row of a manifest cannot have."""
 
@@ -45,6 +45,7 @@ class Where:
     resume: bool
     retries: int
     parts: str | None
+    block_splats: int | None
 
 
 def cluster_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -71,7 +72,13 @@ def cluster_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Times to try again after lost workers and errors of disks and stores.",
         ),
         click.option(
-            "--parts", metavar="DIR", help="Folder or URL for finished segments of a sequence; by default beside the target."
+            "--parts", metavar="DIR",
+            help="Folder or URL for finished segments of a sequence or blocks of a scene; by default beside the target.",
+        ),
+        click.option(
+            "--block-splats", type=click.IntRange(min=1), metavar="N",
+            help="Encode a still scene to .sog4d in blocks of so many splats, also in this process: memory follows the block. "
+            "With another scheduler 1,048,576 by default. The bytes are the same.",
         ),
     )):  # fmt: skip
         command = option(command)
@@ -90,6 +97,8 @@ def check_arguments(sources: tuple[str, ...], target: Path | None, where: Where,
     if where.batch is not None:
         if sources or target is not None:
             raise click.UsageError("--batch takes sources and targets from the manifest; leave out SOURCE and TARGET")
+        if where.block_splats is not None:
+            raise click.UsageError("--block-splats is for one scene; a batch converts each of its scenes as one task")
     elif target is None or not sources:
         raise click.UsageError(f"Missing argument '{'TARGET' if sources else 'SOURCE...'}'.")
     elif where.resume or where.state is not None:
@@ -104,7 +113,7 @@ def is_missing(source: str) -> bool:
 @contextmanager
 def opened(where: Where, jobs: int | None, *, quiet: bool) -> Iterator[Engine | None]:
     """Open the engine, and say where it can be watched; None for one conversion in this process."""
-    if where.scheduler == LOCAL and where.batch is None:
+    if where.scheduler == LOCAL and where.batch is None and where.block_splats is None:
         yield None
         return
     from gsplat_tools.cluster.engines import open_engine
@@ -121,27 +130,58 @@ def opened(where: Where, jobs: int | None, *, quiet: bool) -> Iterator[Engine | 
 def convert_elsewhere(
     sources: tuple[str, ...], target: Path, to: str | None, engine: Engine, where: Where, arguments: dict[str, Any]
 ) -> dict[str, Any]:
-    """Convert a sequence as many tasks, and anything else as one; return its report."""
+    """Convert a sequence or a scene in blocks as many tasks, and anything else as one; return its report."""
     from gsplat_tools.cluster.batches import Item
+    from gsplat_tools.cluster.blocks import WholeSceneError
     from gsplat_tools.cluster.sequences import convert_sequence
     from gsplat_tools.formats.loading import is_single
-    from gsplat_tools.retiming import DEFAULT_MOTION
 
     record = find_target(target, to)
     own = dict(arguments)
-    if record.id == "sog4d" and not (len(sources) == 1 and is_single(Path(local_path(sources[0])))):
-        for name, unset in (("time_at", None), ("frame", None), ("budget", None), ("auto", False), ("motion", DEFAULT_MOTION)):
-            if own.pop(name, unset) != unset:
-                raise CapabilityError(
-                    f"{name.replace('_at', '')} cannot be asked for on a cluster; find options on one machine, then give them"
-                )
-        own.pop("interpolation", None)
+    is_still = len(sources) == 1 and is_single(Path(local_path(sources[0])))
+    if record.id == "sog4d" and not is_still:
+        asked = _take_searches(own)
+        if asked is not None:
+            raise CapabilityError(f"{asked} cannot be asked for on a cluster; find options on one machine, then give them")
         if own.pop("read_options", None):
             raise CapabilityError("frames of other tools' bundles are converted on one machine")
         return convert_sequence(sources, target, engine, parts=where.parts, **own).to_json()
+    if record.id == "sog4d":
+        try:
+            return _convert_blocks(sources[0], target, to, engine, where, dict(own))
+        except WholeSceneError:
+            if where.block_splats is not None:
+                raise
+    elif where.block_splats is not None:
+        raise CapabilityError(f"blocks are for .sog4d targets, not {record.title}; leave out --block-splats", path=target)
     item = Item(line=0, sources=sources, target=str(target), arguments={**own, "to": to})
     outcome = next(engine.results([engine.submit(_convert, item)]))
     return {**outcome.result(), "cluster": {"scheduler": engine.name, "workers": engine.workers, "dashboard": engine.dashboard}}
+
+
+def _convert_blocks(
+    source: str, target: Path, to: str | None, engine: Engine, where: Where, arguments: dict[str, Any]
+) -> dict[str, Any]:
+    """Convert a still scene in blocks, if nothing looks at the whole of it."""
+    from gsplat_tools.cluster.blocks import DEFAULT_BLOCK_SPLATS, WholeSceneError, convert_blocks
+
+    asked = _take_searches(arguments)
+    if asked is not None:
+        raise WholeSceneError(f"{asked} looks at the whole scene")
+    if arguments.pop("read_options", None):
+        raise WholeSceneError("sources with read options are read whole")
+    size = where.block_splats or DEFAULT_BLOCK_SPLATS
+    return convert_blocks(source, target, engine, to=to, parts=where.parts, block_splats=size, **arguments).to_json()
+
+
+def _take_searches(arguments: dict[str, Any]) -> str | None:
+    """Take what looks at more than stored frames out of the arguments; return the first that was asked for."""
+    from gsplat_tools.retiming import DEFAULT_MOTION
+
+    unset = {"time_at": None, "frame": None, "budget": None, "auto": False, "motion": DEFAULT_MOTION}
+    asked = [name.replace("_at", "") for name, value in unset.items() if arguments.pop(name, value) != value]
+    arguments.pop("interpolation", None)
+    return asked[0] if asked else None
 
 
 def _convert(item: Item) -> dict[str, Any]:

@@ -71,7 +71,8 @@ def reports_errors(command: Callable[Parameters, Result]) -> Callable[Parameters
         except GsplatError as error:
             click.echo(f"error: {one_line(error)}", err=True)
         except MemoryError:
-            click.echo("error: not enough memory for this scene; convert it to a target that streams (.gspk, .ply)", err=True)
+            advice = "convert it to a target that streams (.gspk, .ply), or to .sog4d with --block-splats 262144"
+            click.echo(f"error: not enough memory for this scene; {advice}", err=True)
         except BrokenPipeError:
             sys.stderr.close()
         except OSError as error:

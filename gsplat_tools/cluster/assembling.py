@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import io
 import warnings
-from collections.abc import Iterator
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
 from gsplat_tools.cluster import tasks
-from gsplat_tools.cluster.parts import Part, part_bytes
-from gsplat_tools.errors import ClusterError, GsplatWarning, WriteError
+from gsplat_tools.cluster.parts import Hashed, Part, part_bytes
+from gsplat_tools.errors import GsplatWarning, WriteError
 from gsplat_tools.formats._atomic import replacing
 from gsplat_tools.formats._stores import LARGE_BLOCK_BYTES, is_url, local_path, remove, replacing_object, url_of
 from gsplat_tools.formats._zip import ZipWriter
@@ -26,38 +25,14 @@ PARTS_SUFFIX = ".gsplat-parts"
 """Added to the target's name, with a dot before it: the folder of finished segments."""
 
 
-class _Hashed:
-    """A stream that is written from start to end, and its SHA-256."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-        self.digest = hashlib.sha256()
-        self.size = 0
-
-    def seekable(self) -> bool:
-        return False
-
-    def tell(self) -> int:
-        return self.size
-
-    def write(self, data: bytes) -> int:
-        self._stream.write(data)
-        self.digest.update(data)
-        self.size += len(data)
-        return len(data)
-
-    def flush(self) -> None:
-        pass
-
-
 def assemble(target: Path, found: list[Part], entries: dict[str, bytes], shared: Shared, *, overwrite: bool) -> tuple[int, str]:
     """Write the bundle from its parts, in the order of frames, and publish it; return its size and SHA-256."""
-    with stage("writing", len(found), "segments") as progress, _opened(target, overwrite=overwrite) as stream:
-        hashed = _Hashed(stream)
+    with stage("writing", len(found), "parts") as progress, _opened(target, overwrite=overwrite) as stream:
+        hashed = Hashed(stream)
         archive = ZipWriter(hashed)  # type: ignore[arg-type] # all that is needed of a stream
         for part in found:
             images = [entry for entry in part.entries if entry.name.startswith("frames/")]
-            archive.graft(images, _moved(part, 0, part.images))
+            archive.graft(images, part_bytes(part.path, 0, part.images))
             progress.advance(1)
         deltas = {name: part for part in found for name in part.deltas}
         for name in sorted([*entries, *deltas]):
@@ -67,19 +42,10 @@ def assemble(target: Path, found: list[Part], entries: dict[str, bytes], shared:
                 part = deltas[name]
                 offset, size = part.deltas[name]
                 own = [entry for entry in part.entries if entry.name == name]
-                archive.graft(own, _moved(part, offset, size), start=offset)
+                archive.graft(own, part_bytes(part.path, offset, size), start=offset)
         archive.close()
         size = hashed.size
     return size, hashed.digest.hexdigest()
-
-
-def _moved(part: Part, start: int, size: int) -> Iterator[bytes]:
-    """Yield bytes of a part, saying what to do where it went missing."""
-    try:
-        yield from part_bytes(part.path, start, size)
-    except FileNotFoundError as error:
-        message = "a finished segment is gone; is the folder of parts one that all workers and this machine share? See --parts"
-        raise ClusterError(message, path=part.path) from error
 
 
 def _add(archive: ZipWriter, name: str, data: bytes, shared: Shared) -> None:

@@ -47,7 +47,7 @@ class Item:
 
     def digest(self) -> str:
         """Return what changes with the options and with the version of this package."""
-        from gsplat_tools.cluster.tasks import fingerprint
+        from gsplat_tools.cluster.runs import fingerprint
 
         said = {name: repr(value) for name, value in sorted(self.arguments.items()) if name != "overwrite"}
         described = [self.sources, self.target, said, fingerprint()[0]]

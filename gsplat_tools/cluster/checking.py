@@ -8,6 +8,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.comparison.attributes import AttributeTally
 from gsplat_tools.comparison.rendered import ViewReport, compare_rendered
@@ -20,6 +22,7 @@ from gsplat_tools.formats.sog4d.labels import moved_delta
 from gsplat_tools.formats.sog4d.options import Sog4dReadOptions
 from gsplat_tools.formats.sog4d.segments import SegmentFacts, delta_path
 from gsplat_tools.sequence import GaussianSequence
+from gsplat_tools.verification import VALIDATED_FRAMES, Validation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +41,15 @@ class Checks:
     views: int
     size: tuple[int, int]
     model: tuple[str, str | None]
+
+
+def checks_of(model: tuple[str, str | None], num_frames: int, validation: Validation | None) -> Checks | None:
+    """Return how segments are checked."""
+    if validation is None:
+        return None
+    rendered = np.linspace(0, num_frames - 1, VALIDATED_FRAMES).round().astype(int).tolist()
+    chosen = model if validation.model is None else (validation.model, None)
+    return Checks(frames=tuple(sorted(set(rendered))), views=validation.views, size=validation.size, model=chosen)
 
 
 class CheckedSegment:

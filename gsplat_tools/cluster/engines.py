@@ -178,7 +178,11 @@ class Processes:
             self._run_alone(task)
         self._start()
         for each in self._unfinished:
-            each.future = self._pool.submit(_run_here, each.function, self._settings, *each.arguments)
+            try:
+                each.future = self._pool.submit(_run_here, each.function, self._settings, *each.arguments)
+            except BrokenProcessPool as error:  # one died again meanwhile: whoever waits for this task replaces it
+                each.future = Future()
+                each.future.set_exception(error)
 
     def _run_alone(self, task: _Task) -> None:
         """Run a task in a process of its own, to tell whether it is this one that ends processes."""

@@ -1,15 +1,17 @@
-"""The part of a bundle that one segment makes, as a file of its own between a worker and the assembly.
+"""Parts: what a worker leaves for later tasks, the assembly and the next run, each a file of its own.
 
-Layout: the entries as they will stand in the archive, then JSON that describes them, then its length (8 bytes, little
-endian), the SHA-256 of everything before, and a magic number. A file that was cut off or changed is no part.
+Layout: the bytes, then JSON that describes them, then its length (8 bytes, little endian), the SHA-256 of everything before,
+and a magic number. A file that was cut off or changed is no part. The part of a segment holds entries as they will stand
+in the archive.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import tempfile
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,9 +20,9 @@ import numpy as np
 
 from gsplat_tools.comparison.attributes import AttributeStatistics, AttributeTally
 from gsplat_tools.comparison.rendered import ViewReport
-from gsplat_tools.errors import CorruptDataError
+from gsplat_tools.errors import ClusterError, CorruptDataError, ReadError, WriteError
 from gsplat_tools.formats._atomic import replacing
-from gsplat_tools.formats._files import open_source_file
+from gsplat_tools.formats._files import open_source_file, reason
 from gsplat_tools.formats._stores import exists, is_url, replacing_object
 from gsplat_tools.formats._stream import read_exactly, stream_size
 from gsplat_tools.formats._zip import Entry
@@ -29,6 +31,72 @@ from gsplat_tools.formats.sog4d.segments import SegmentFacts
 MAGIC = b"GSPART01"
 _TAIL = 8 + 32 + len(MAGIC)
 _BLOCK = 4 << 20
+
+
+class Hashed:
+    """A stream that is written from start to end, and its SHA-256."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self.digest = hashlib.sha256()
+        self.size = 0
+
+    def seekable(self) -> bool:
+        """Return False: nothing is written again."""
+        return False
+
+    def tell(self) -> int:
+        """Return the number of bytes so far."""
+        return self.size
+
+    def write(self, data: Any) -> int:
+        """Append bytes."""
+        view = memoryview(data).cast("B")
+        self._stream.write(view)
+        self.digest.update(view)
+        self.size += len(view)
+        return len(view)
+
+    def flush(self) -> None:
+        """Do nothing: the stream below knows when."""
+
+
+@contextmanager
+def sealed(path: str, said: dict[str, Any]) -> Iterator[Hashed]:
+    """Open a part that appears, whole, when the block ends; it says `said` about itself."""
+    opened = replacing_object(path, overwrite=True) if is_url(path) else replacing(Path(path), overwrite=True)
+    with opened as stream:
+        body = Hashed(stream)
+        yield body
+        text = json.dumps(said).encode()
+        body.write(text + len(text).to_bytes(8, "little"))
+        stream.write(body.digest.digest() + MAGIC)
+
+
+def read_sealed(path: str, key: str) -> dict[str, Any] | None:
+    """Return what a part says about itself, after reading all its bytes; None where there is none of that key."""
+    if not exists(path):
+        return None
+    try:
+        with closing(open_source_file(Path(path))) as stream:
+            size = stream_size(stream)
+            if size < _TAIL:
+                return None
+            digest = hashlib.sha256()
+            left = size - _TAIL + 8
+            while left:
+                block = read_exactly(stream, min(left, _BLOCK), field="part")
+                digest.update(block)
+                left -= len(block)
+            if read_exactly(stream, _TAIL - 8, field="part") != digest.digest() + MAGIC:
+                return None
+            stream.seek(size - _TAIL)
+            length = int.from_bytes(read_exactly(stream, 8, field="part"), "little")
+            stream.seek(size - _TAIL - length)
+            said: dict[str, Any] = json.loads(read_exactly(stream, length, field="part"))
+    except (CorruptDataError, FileNotFoundError, ValueError):
+        return None
+    return said if said.get("key") == key else None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -79,18 +147,28 @@ class Part:
             "ranges": [[low.tolist(), high.tolist()] for low, high in facts.ranges],
             "sources": sorted(facts.sources),
             "clipped": facts.clipped,
-            "tally": None if self.tally is None else {name: asdict(each) for name, each in self.tally.attributes.items()},
+            "tally": tally_to_json(self.tally),
             "views": [asdict(view) for view in self.views],
             "seconds": self.seconds,
         }
 
 
+def tally_to_json(tally: AttributeTally | None) -> dict[str, Any] | None:
+    """Return errors so that they can be added up later."""
+    return None if tally is None else {name: asdict(each) for name, each in tally.attributes.items()}
+
+
+def tally_from_json(said: dict[str, Any] | None) -> AttributeTally | None:
+    """Return what `tally_to_json` gave."""
+    if said is None:
+        return None
+    tally = AttributeTally()
+    tally.attributes = {name: AttributeStatistics(**each) for name, each in said.items()}
+    return tally
+
+
 def part_from_json(path: str, said: dict[str, Any]) -> Part:
     """Return what `Part.to_json` gave."""
-    tally = None
-    if said["tally"] is not None:
-        tally = AttributeTally()
-        tally.attributes = {name: AttributeStatistics(**each) for name, each in said["tally"].items()}
     facts = SegmentFacts(
         ranges=[(np.array(low, np.float32), np.array(high, np.float32)) for low, high in said["ranges"]],
         sources=set(said["sources"]),
@@ -103,7 +181,7 @@ def part_from_json(path: str, said: dict[str, Any]) -> Part:
         images=said["images"],
         deltas={name: (start, size) for name, (start, size) in said["deltas"].items()},
         facts=facts,
-        tally=tally,
+        tally=tally_from_json(said["tally"]),
         views=[ViewReport(**view) for view in said["views"]],
         seconds=said["seconds"],
         kept=True,
@@ -112,50 +190,48 @@ def part_from_json(path: str, said: dict[str, Any]) -> Part:
 
 def write_part(part: Part, body: BinaryIO) -> None:
     """Write a part whose entries are in `body`; it appears whole or not at all."""
-    opened = replacing_object(part.path, overwrite=True) if is_url(part.path) else replacing(Path(part.path), overwrite=True)
-    digest = hashlib.sha256()
     body.seek(0)
-    with opened as stream:
+    with sealed(part.path, part.to_json()) as stream:
         while block := body.read(_BLOCK):
-            digest.update(block)
             stream.write(block)
-        text = json.dumps(part.to_json()).encode()
-        said = text + len(text).to_bytes(8, "little")
-        digest.update(said)
-        stream.write(said + digest.digest() + MAGIC)
 
 
 def read_part(path: str, key: str) -> Part | None:
     """Return the part that an earlier run left, after reading all its bytes; None where there is none that can be used."""
-    if not exists(path):
-        return None
+    said = read_sealed(path, key)
     try:
-        with closing(open_source_file(Path(path))) as stream:
-            size = stream_size(stream)
-            if size < _TAIL:
-                return None
-            digest = hashlib.sha256()
-            left = size - _TAIL + 8
-            while left:
-                block = read_exactly(stream, min(left, _BLOCK), field="part")
-                digest.update(block)
-                left -= len(block)
-            if read_exactly(stream, _TAIL - 8, field="part") != digest.digest() + MAGIC:
-                return None
-            stream.seek(size - _TAIL)
-            length = int.from_bytes(read_exactly(stream, 8, field="part"), "little")
-            stream.seek(size - _TAIL - length)
-            part = part_from_json(path, json.loads(read_exactly(stream, length, field="part")))
-    except (CorruptDataError, FileNotFoundError, ValueError, KeyError, TypeError):
+        return None if said is None else part_from_json(path, said)
+    except (ValueError, KeyError, TypeError):
         return None
-    return part if part.key == key else None
 
 
-def part_bytes(path: str, start: int, size: int) -> Iterator[bytes]:
-    """Yield bytes of a part in blocks, read by range."""
-    with closing(open_source_file(Path(path))) as stream:
+def part_bytes(path: str, start: int, size: int, step: int = _BLOCK) -> Iterator[bytes]:
+    """Yield bytes of a part in blocks of `step`, read by range.
+
+    Raises
+    ------
+    ClusterError
+        It went missing.
+    """
+    try:
+        stream = open_source_file(Path(path))
+    except FileNotFoundError as error:
+        message = "a finished part is gone; is the folder of parts one that all workers and this machine share? See --parts"
+        raise ClusterError(message, path=path) from error
+    with closing(stream):
         stream.seek(start)
         while size:
-            block = read_exactly(stream, min(size, _BLOCK), field="part")
+            block = read_exactly(stream, min(size, step), field="part")
             size -= len(block)
             yield block
+
+
+@contextmanager
+def temporary_data() -> Iterator[None]:
+    """Turn what the operating system refuses a worker into an error that says where."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, ReadError | WriteError | FileNotFoundError):
+            raise
+        raise WriteError(f"cannot write temporary data: {reason(error)}", path=tempfile.gettempdir()) from error

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,13 @@ import numpy as np
 
 from gsplat_tools.cluster import tasks
 from gsplat_tools.cluster.assembling import assemble, check_published, folder_of_parts, remove_parts
-from gsplat_tools.cluster.checking import Checks, merged_tally
-from gsplat_tools.cluster.engines import Dask, Engine
-from gsplat_tools.cluster.outcomes import Outcome, warn_again
+from gsplat_tools.cluster.checking import Checks, checks_of
+from gsplat_tools.cluster.engines import Engine
+from gsplat_tools.cluster.outcomes import warn_again
 from gsplat_tools.cluster.parts import Part
-from gsplat_tools.comparison.rendered import summarize_views
-from gsplat_tools.convert import ConversionReport, unique_warnings
-from gsplat_tools.errors import CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError
+from gsplat_tools.cluster.runs import ClusterReport, Stages, check_alike, judge, key_of
+from gsplat_tools.convert import unique_warnings
+from gsplat_tools.errors import CapabilityError, GsplatWarning, TargetExistsError
 from gsplat_tools.formats._limits import max_memory
 from gsplat_tools.formats._stores import exists, is_url, local_path, url_of
 from gsplat_tools.formats.loading import inspect_file
@@ -33,51 +32,12 @@ from gsplat_tools.formats.sog4d.codebooks import Shared
 from gsplat_tools.formats.sog4d.encode import choose_layout, choose_times, last_entries, warn_clipped
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
 from gsplat_tools.formats.sog4d.segments import choose_segments, has_deltas
-from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence
-from gsplat_tools.verification import DEFAULT_VALIDATION, VALIDATED_FRAMES, Validation
+from gsplat_tools.verification import DEFAULT_VALIDATION, Validation
 
 _TASKS_A_WORKER = 8
 _MOST_FRAMES = 64
 """Of a task that only looks at frames."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SequenceReport(ConversionReport):
-    """A conversion report, and what the cluster did."""
-
-    cluster: dict[str, Any] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the report with the fixed names of the command line's JSON."""
-        return {**ConversionReport.to_json(self), "cluster": self.cluster}
-
-
-class _Stages:
-    """Runs the tasks of each stage, shows progress, and adds up what they took."""
-
-    def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-        self.outcomes: list[Outcome] = []
-        self.spent: dict[str, dict[str, float]] = {}
-
-    def run(self, name: str, label: str, pending: Sequence[Any], sizes: Sequence[int]) -> Iterator[Any]:
-        """Yield results in order; `sizes` are the frames of each task."""
-        start, busy = time.perf_counter(), 0.0
-        with stage(label, sum(sizes), "frames") as progress:
-            for outcome, size in zip(self.engine.results(pending), sizes, strict=True):
-                busy += outcome.seconds
-                value = outcome.result()
-                self.outcomes.append(Outcome(warnings=outcome.warnings))
-                progress.advance(size)
-                yield value
-        self.note(name, tasks=len(pending), seconds=time.perf_counter() - start, task_seconds=busy)
-
-    def note(self, name: str, **numbers: float) -> None:
-        """Add to what a stage took."""
-        stage_numbers = self.spent.setdefault(name, {})
-        for key, number in numbers.items():
-            stage_numbers[key] = round(stage_numbers.get(key, 0) + number, 4)
 
 
 def convert_sequence(
@@ -90,7 +50,7 @@ def convert_sequence(
     validation: Validation | None = DEFAULT_VALIDATION,
     parts: str | None = None,
     **options: Any,
-) -> SequenceReport:
+) -> ClusterReport:
     """Convert frames to a .sog4d bundle; the same bytes as `convert` gives, wherever the tasks run.
 
     Parameters
@@ -115,7 +75,7 @@ def convert_sequence(
 
     Returns
     -------
-    SequenceReport
+    ClusterReport
         As of `convert`, and the seconds and bytes of every stage.
 
     Raises
@@ -141,11 +101,11 @@ def convert_sequence(
     names = tuple(url_of(path) if is_url(path) else str(path.absolute()) for path in files)
     source = tasks.FrameSource(files=names, first=first, max_memory=max_memory())
     times = choose_times(_times_of(source, frame_times), len(files), write_options)
-    stages = _Stages(engine)
+    stages = Stages(engine)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", GsplatWarning)
-        _check_alike(engine)
-        job = _Job(source, choices, write_options, stages, _checks(record.model, len(files), validation))
+        check_alike(engine)
+        job = _Job(source, choices, write_options, stages, checks_of(record.model, len(files), validation))
         kept, fit, shared = job.fit()
         looked = time.perf_counter()
         folder = folder_of_parts(target, parts)
@@ -153,20 +113,22 @@ def convert_sequence(
         encoded = time.perf_counter()
         busy = [sum(part.seconds.get(name, 0) for part in found) for name in ("validate", "read", "encode", "write")]
         checking = busy[0] / (sum(busy) or 1)
-        validated = _judge(found, validation, record.model)
+        validated = judge(
+            [view for part in found for view in part.views], [part.tally for part in found], validation, record.model
+        )
         warn_again(stages.outcomes)
         facts = [part.facts for part in found]
         warn_clipped(facts)
         shared_here: Shared = next(iter(stages.run("collect", "fetching codebooks", [shared], [0])))
         num_splats = int(np.count_nonzero(kept.keeps))
         entries = last_entries(shared_here, num_splats, job.segments, times, facts, uses_deltas=job.uses_deltas)
-        start = time.perf_counter()
+        assembling = time.perf_counter()
         size, digest = assemble(target, found, entries, shared_here, overwrite=overwrite)
-        stages.note("assemble", seconds=time.perf_counter() - start, bytes=size)
+        stages.note("assemble", seconds=time.perf_counter() - assembling, bytes=size)
         if not is_url(target):
             check_published(target, num_splats, len(files), shared_here.bands)
         remove_parts(folder)
-    return SequenceReport(
+    return ClusterReport(
         source=", ".join(map(url_of, sources)),
         source_format=first_record.id,
         path=target,
@@ -202,7 +164,7 @@ class _Job:
     """The tasks of one sequence."""
 
     def __init__(
-        self, source: tasks.FrameSource, choices: SaveChoices, options: Sog4dOptions, stages: _Stages, checks: Checks | None
+        self, source: tasks.FrameSource, choices: SaveChoices, options: Sog4dOptions, stages: Stages, checks: Checks | None
     ) -> None:
         self.source, self.choices, self.options, self.stages, self.checks = source, choices, options, stages, checks
         self.num_frames = len(source.files)
@@ -263,16 +225,13 @@ class _Job:
 
     def _key(self) -> str:
         """Return a digest of everything that the bytes of parts, and what was checked, follow from."""
-        versions, able = tasks.fingerprint()
         described = {
-            "versions": versions,
-            "processor": able,
             "frames": list(zip(self.source.files, self.identities, strict=True)),
             "choices": repr(self.choices),
             "options": repr(self.options),
             "checks": None if self.checks is None else asdict(self.checks),
         }
-        return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
+        return key_of(described)
 
 
 def _times_of(source: tasks.FrameSource, frame_times: Any) -> GaussianSequence:
@@ -283,48 +242,3 @@ def _times_of(source: tasks.FrameSource, frame_times: Any) -> GaussianSequence:
     return GaussianSequence(
         source.load, num_splats=source.first.splats, sh_degree=source.first.sh_degree, frame_times=frame_times, num_frames=count
     )
-
-
-def _check_alike(engine: Engine) -> None:
-    """Refuse workers whose versions would give other bytes, and warn of unlike processors."""
-    if not isinstance(engine, Dask):
-        return
-    own, _ = tasks.fingerprint()
-    found = engine.run_everywhere(tasks.fingerprint)
-    for versions, _ in found:
-        unlike = [f"{name} {versions[name]} instead of {own[name]}" for name in own if versions[name] != own[name]]
-        if unlike:
-            raise ClusterError(f"a worker has {', '.join(unlike)}: install the same versions everywhere")
-    if len({able for _, able in found}) > 1:
-        message = "the workers have unlike processors, whose roundings may differ: bytes may depend on who encodes what"
-        warnings.warn(GsplatWarning(message, code="unlike-workers"), stacklevel=3)
-
-
-def _checks(model: tuple[str, str | None], num_frames: int, validation: Validation | None) -> Checks | None:
-    """Return how segments are checked."""
-    if validation is None:
-        return None
-    rendered = np.linspace(0, num_frames - 1, VALIDATED_FRAMES).round().astype(int).tolist()
-    chosen = model if validation.model is None else (validation.model, None)
-    return Checks(frames=tuple(sorted(set(rendered))), views=validation.views, size=validation.size, model=chosen)
-
-
-def _judge(found: list[Part], validation: Validation | None, model: tuple[str, str | None]) -> dict[str, Any] | None:
-    """Return what the checks of all segments say together."""
-    if validation is None:
-        return None
-    result: dict[str, Any] = {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None}
-    views = [view for part in found for view in part.views]
-    if views:
-        name, variant = model if validation.model is None else (validation.model, None)
-        report = summarize_views(views, name if variant is None else f"{name} {variant}", 0)
-        result = {each: getattr(report, each) for each in ("psnr_min", "psnr_mean", "ssim_mean", "max_abs", "identical")}
-        result |= {"worst_view": report.worst_view, "model": report.model}
-    level = result["psnr_min"]
-    if validation.min_psnr is not None and level is not None and level < validation.min_psnr:
-        raise ValidationError(
-            f"the worst view has {level:.2f} dB, below --min-psnr {validation.min_psnr:g}; the target is left as it was. "
-            "Use --preset best or a lower --min-psnr"
-        )
-    tally = merged_tally([part.tally for part in found if part.tally is not None])
-    return {**result, "attributes": tally.to_json(), "passed": True}

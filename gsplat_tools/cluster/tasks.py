@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import json
-import platform
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from gsplat_tools.chunks import CloudChunks
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.cluster.checking import CheckedSegment, Checks
-from gsplat_tools.cluster.parts import Part, read_part, write_part
-from gsplat_tools.errors import ReadError, WriteError
-from gsplat_tools.formats._files import reason
+from gsplat_tools.cluster.parts import Part, read_part, temporary_data, write_part
 from gsplat_tools.formats._limits import use_max_memory
 from gsplat_tools.formats._stores import identity
 from gsplat_tools.formats._zip import ZipWriter
 from gsplat_tools.formats.base import FileInfo
-from gsplat_tools.formats.loading import inspect_file
+from gsplat_tools.formats.loading import inspect_file, open_scene
 from gsplat_tools.formats.preparing import SaveChoices
 from gsplat_tools.formats.preparing_frames import FrameFacts, FrameFit, Kept, decide_fit, fitted_sequence, look_at_frame
 from gsplat_tools.formats.registry import FORMATS
@@ -45,7 +42,7 @@ FORMAT = FORMATS["sog4d"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSource:
-    """Where the frames are.
+    """Where the frames are; a still scene is one.
 
     Parameters
     ----------
@@ -66,30 +63,19 @@ class FrameSource:
         with use_max_memory(self.max_memory):
             return load_frame(Path(self.files[frame_id]), frame_id, self.first)
 
+    @contextmanager
+    def chunks(self) -> Iterator[CloudChunks]:
+        """Open the first file in chunks, invalid splats included."""
+        with use_max_memory(self.max_memory), open_scene(Path(self.files[0]), in_chunks=True) as scene:
+            assert isinstance(scene, CloudChunks)
+            yield scene
+
     def fitted(self, fit: FrameFit) -> GaussianSequence:
         """Return the frames as they are to be written."""
         found = GaussianSequence(
             self.load, num_splats=self.first.splats, sh_degree=self.first.sh_degree, num_frames=len(self.files)
         )
         return fitted_sequence(found, fit)
-
-
-def fingerprint() -> tuple[dict[str, str], str]:
-    """Return the versions on which the bytes of a bundle depend, and what the processor can do."""
-    import numba
-    from PIL import features
-
-    import gsplat_tools
-
-    versions = {
-        "gsplat_tools": gsplat_tools.__version__,
-        "numpy": np.__version__,
-        "numba": numba.__version__,
-        "libwebp": features.version("webp") or "missing",
-        "python": platform.python_version(),
-    }
-    able = json.dumps(np.show_config(mode="dicts").get("SIMD Extensions", {}).get("found", []))
-    return versions, f"{platform.machine()} {able}"
 
 
 def identify_frames(source: FrameSource, start: int, stop: int) -> list[str]:
@@ -146,39 +132,34 @@ def encode_segment(
     start, options = time.perf_counter(), shared.options
     frames = _Timed(Frames(source.fitted(fit)))
     facts = SegmentFacts()
-    try:
-        with tempfile.TemporaryFile() as body, CheckedSegment(shared, segment, checks) as alone:
-            archive = ZipWriter(body)
-            images = segment_images(frames.load, segment, shared, facts, uses_deltas=uses_deltas)
-            for name, data in map_ordered(partial(compress_image, effort=options.webp_effort), images):
-                archive.add(name, data, image_compression(options))
-                alone.add(name, data)
-            num_images = archive.size
-            deltas = {}
-            for name, data in facts.deltas.items():
-                offset = archive.size
-                archive.add(name, data, data_compression(options))
-                deltas[name] = (offset, archive.size - offset)
-            encoded = time.perf_counter()
-            reading = frames.seconds
-            alone.check(source.fitted(fit), facts, uses_deltas=uses_deltas)
-            checked = time.perf_counter()
-            part = Part(
-                path=path,
-                key=key,
-                entries=archive.entries,
-                images=num_images,
-                deltas=deltas,
-                facts=facts,
-                tally=alone.tally,
-                views=alone.views,
-                seconds={"read": reading, "encode": encoded - start - reading, "validate": checked - encoded},
-            )
-            write_part(part, body)
-    except OSError as error:
-        if isinstance(error, ReadError | WriteError | FileNotFoundError):
-            raise
-        raise WriteError(f"cannot write temporary data: {reason(error)}", path=tempfile.gettempdir()) from error
+    with temporary_data(), tempfile.TemporaryFile() as body, CheckedSegment(shared, segment, checks) as alone:
+        archive = ZipWriter(body)
+        images = segment_images(frames.load, segment, shared, facts, uses_deltas=uses_deltas)
+        for name, data in map_ordered(partial(compress_image, effort=options.webp_effort), images):
+            archive.add(name, data, image_compression(options))
+            alone.add(name, data)
+        num_images = archive.size
+        deltas = {}
+        for name, data in facts.deltas.items():
+            offset = archive.size
+            archive.add(name, data, data_compression(options))
+            deltas[name] = (offset, archive.size - offset)
+        encoded = time.perf_counter()
+        reading = frames.seconds
+        alone.check(source.fitted(fit), facts, uses_deltas=uses_deltas)
+        checked = time.perf_counter()
+        part = Part(
+            path=path,
+            key=key,
+            entries=archive.entries,
+            images=num_images,
+            deltas=deltas,
+            facts=facts,
+            tally=alone.tally,
+            views=alone.views,
+            seconds={"read": reading, "encode": encoded - start - reading, "validate": checked - encoded},
+        )
+        write_part(part, body)
     part.seconds["write"] = time.perf_counter() - checked
     part.facts.deltas = {}  # they are in the file, and need not travel
     return part

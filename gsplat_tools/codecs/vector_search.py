@@ -39,7 +39,9 @@ _MOMENT_ROWS = 4096
 
 
 @remembered
-def nearest_labels(points: Float32, centroids: Float32, *, probes: int | None = None) -> tuple[Labels, Float32]:
+def nearest_labels(
+    points: Float32, centroids: Float32, *, probes: int | None = None, pilot: Float32 | None = None
+) -> tuple[Labels, Float32]:
     """Return the label of the nearest centroid of every point, and the squared distance.
 
     Parameters
@@ -51,6 +53,9 @@ def nearest_labels(points: Float32, centroids: Float32, *, probes: int | None = 
     probes
         Look for each point at this many cells of at most 64 centroids alone, those whose boxes are nearest; by default the
         search is exact. Has no effect in three dimensions or below 1,024 centroids.
+    pilot
+        Rows on which it is tried how to search; by default `pilot_rows` of the points. Where the points are a part of more,
+        those of all of them give every point the label that it has among all.
 
     Returns
     -------
@@ -68,11 +73,16 @@ def nearest_labels(points: Float32, centroids: Float32, *, probes: int | None = 
             return _nearest_by_products(points, centroids)
         cells = _Cells.of(centroids)
         if probes is None:
-            pilot = points[:: max(1, len(points) // _PILOT_POINTS)]
-            if cells.search(pilot, _FIRST_PROBES, is_exact=True)[2] > _MAX_WORK:
+            tried = points[pilot_rows(len(points))] if pilot is None else pilot
+            if cells.search(tried, _FIRST_PROBES, is_exact=True)[2] > _MAX_WORK:
                 return _nearest_by_products(points, centroids)
         labels, distances, _ = cells.search(points, probes or _FIRST_PROBES, is_exact=probes is None)
     return labels, distances
+
+
+def pilot_rows(count: int) -> slice:
+    """Return which of `count` points an exact search is tried on: 512 at least where there are, and less than 1,024."""
+    return slice(None, None, max(1, count // _PILOT_POINTS))
 
 
 @contextmanager

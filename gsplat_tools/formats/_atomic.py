@@ -71,6 +71,22 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
 
 
 @contextmanager
+def replacing_in_any_order(path: Path) -> Iterator[BinaryIO]:
+    """Open a temporary file that takes the place of `path`, to be written in any order.
+
+    It is not read back: whoever writes it knows what it has to hold, and has to look before using it.
+    """
+    with _explained(path):
+        sweep_stale(path)
+        with temporary_beside(path) as locked:
+            with open(locked.name, "r+b") as stream:  # noqa: PTH123 - beside os.replace
+                yield stream
+            if os.name != "posix":
+                locked.close()  # see `replacing`
+            os.replace(locked.name, path)  # noqa: PTH105 - beside os.link and os.fsync
+
+
+@contextmanager
 def temporary_beside(target: Path) -> Iterator[BinaryIO]:
     """Open a temporary file in the folder of a target, that is gone when the block ends."""
     names: list[Path] = []  # before there is a file: a signal may end the process between any two lines

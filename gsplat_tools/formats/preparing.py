@@ -7,7 +7,6 @@ stays bounded where the target streams.
 from __future__ import annotations
 
 import warnings
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,11 +16,9 @@ from numpy.typing import NDArray
 from gsplat_tools.attributes.coordinate_systems import is_known
 from gsplat_tools.chunks import CloudChunks, as_chunks
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.errors import CapabilityError, CloudError, GsplatWarning, LossyConversionWarning, counts_in_words
+from gsplat_tools.errors import CapabilityError, GsplatWarning, LossyConversionWarning
 from gsplat_tools.formats.base import Format, Scene
-from gsplat_tools.formats.loading import warn_dropped
-from gsplat_tools.ops.visibility import Viewpoint, viewpoint_of
-from gsplat_tools.progress import stage
+from gsplat_tools.formats.scanning import Scan, clean, scan_chunks
 from gsplat_tools.sequence import GaussianSequence
 
 WORTHWHILE_GAIN = 2.0
@@ -95,38 +92,6 @@ class Prepared:
     dropped: dict[str, int] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
-class Scan:
-    """What one pass over a scene finds out."""
-
-    num_splats: int = 0
-    num_kept: int = 0
-    dropped: Counter[str] = field(default_factory=Counter)
-    low: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))
-    high: NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))
-    sh_degree: int = 0
-    view: Viewpoint | None = None
-    """From where splats are looked at that are dropped for being faint."""
-
-    def add(self, cloud: GaussianCloud) -> None:
-        """Take one more chunk, already cleaned, into account."""
-        from gsplat_tools.ops.harmonics import effective_sh_degree
-
-        self.num_kept += len(cloud)
-        if len(cloud):
-            self.low = np.minimum(self.low, cloud.means.min(axis=0))
-            self.high = np.maximum(self.high, cloud.means.max(axis=0))
-            if self.sh_degree < cloud.sh_degree:
-                self.sh_degree = max(self.sh_degree, effective_sh_degree(cloud))
-
-    def merge(self, other: Scan) -> None:
-        """Take what another scan found into account."""
-        self.num_kept += other.num_kept
-        self.low = np.minimum(self.low, other.low)
-        self.high = np.maximum(self.high, other.high)
-        self.sh_degree = max(self.sh_degree, other.sh_degree)
-
-
 def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
     """Fit a scene to its target.
 
@@ -172,7 +137,7 @@ def prepare(scene: Scene, target: Format, choices: SaveChoices) -> Prepared:
     if choices.outliers == "drop":
         scene, num_outliers = _without_outliers(scene, choices)
     chunks = as_chunks(scene, max(len(scene), 1)) if in_one else as_chunks(scene)
-    scan = _scan(chunks, choices)
+    scan = scan_chunks(chunks, choices)
     if num_outliers:
         scan.dropped["outliers"] += num_outliers
     fit = Fit(chunks.template, target, choices, scan)
@@ -203,47 +168,6 @@ def _without_outliers(scene: GaussianCloud | CloudChunks, choices: SaveChoices) 
     stays = np.ones(len(cloud), np.bool_)
     stays[outliers] = False
     return cloud.take(stays), len(outliers)
-
-
-def _scan(chunks: CloudChunks, choices: SaveChoices) -> Scan:
-    """Go through the scene: invalid splats, bounds, highest band in use; before that from where it is looked at, if it is."""
-    scan = Scan(view=_view(chunks, choices))
-    with stage("reading", len(chunks)) as progress:
-        for chunk in chunks:
-            scan.num_splats += len(chunk)
-            scan.add(_clean(chunk, choices, scan.view, scan.dropped))
-            progress.advance(len(chunk))
-    invalid = {cause: count for cause, count in scan.dropped.items() if cause not in ("pruned-opacity", "pruned-faint")}
-    if choices.strict and invalid:
-        raise CloudError(
-            f"{sum(invalid.values())} of {scan.num_splats} splats would be dropped: {counts_in_words(invalid)}; "
-            "repair them or leave out --strict"
-        )
-    warn_dropped(invalid, scan.num_splats)
-    return scan
-
-
-def _view(chunks: CloudChunks, choices: SaveChoices) -> Viewpoint | None:
-    """Return from where valid and opaque splats are looked at; None where nothing is dropped for being faint."""
-    if not choices.prune_faint:
-        return None
-    return viewpoint_of((_clean(chunk, choices) for chunk in chunks), len(chunks))
-
-
-def _clean(
-    chunk: GaussianCloud, choices: SaveChoices, view: Viewpoint | None = None, dropped: Counter[str] | None = None
-) -> GaussianCloud:
-    """Drop invalid and pruned splats of a chunk, counting them; with a view, faint ones too."""
-    from gsplat_tools.ops.filtering import drop_invalid, prune_faint, prune_opacity
-
-    kept, causes = drop_invalid(chunk)
-    kept, pruned = prune_opacity(kept, choices.prune_opacity)
-    causes["pruned-opacity"] = pruned
-    if view is not None and choices.prune_faint:
-        kept, causes["pruned-faint"] = prune_faint(kept, choices.prune_faint, view)
-    if dropped is not None:
-        dropped.update({cause: count for cause, count in causes.items() if count})
-    return kept
 
 
 class Fit:
@@ -282,7 +206,7 @@ class Fit:
 
     def __call__(self, chunk: GaussianCloud) -> GaussianCloud:
         """Clean a chunk as it was found and apply the decisions to it."""
-        return self.apply(_clean(chunk, self._choices, self._view) if self._drops_anything else chunk)
+        return self.apply(clean(chunk, self._choices, self._view) if self._drops_anything else chunk)
 
     def apply(self, chunk: GaussianCloud) -> GaussianCloud:
         """Apply the decisions to splats that are already clean."""
@@ -303,6 +227,14 @@ class Fit:
         if not self._target.stores_origin and chunk.origin.any():
             chunk = chunk.replace(origin=np.zeros(3))  # given up with a warning: what is written starts from here
         return chunk
+
+    def box(self, template: GaussianCloud, scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the ends of the positions as they will be written, (3,) each.
+
+        Axes trade places and change their signs, and shifts are rounded, which keeps the order: corners stay corners.
+        """
+        corners = self.apply(template.replace(**_corner_arrays(scan.low, scan.high, template)))
+        return corners.means.min(axis=0), corners.means.max(axis=0)
 
     def _turn(self, cloud: GaussianCloud) -> GaussianCloud:
         """Name the source's axes and convert them."""

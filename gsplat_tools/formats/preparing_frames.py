@@ -16,7 +16,8 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CloudError, counts_in_words
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.loading import warn_dropped
-from gsplat_tools.formats.preparing import Fit, Prepared, SaveChoices, Scan
+from gsplat_tools.formats.preparing import Fit, Prepared, SaveChoices
+from gsplat_tools.formats.scanning import Scan
 from gsplat_tools.ops.visibility import lit_pixels, viewpoint
 from gsplat_tools.progress import stage
 from gsplat_tools.sequence import GaussianSequence

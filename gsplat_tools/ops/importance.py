@@ -29,15 +29,28 @@ def importance(cloud: GaussianCloud) -> NDArray[np.float32]:
     ------
     Opacity x area weights in palette clustering: nerfstudio-project/gsplat, pull request 1063.
     """
-    if len(cloud) == 0:
-        return np.ones(0, np.float32)
+    logs = log_weights(cloud)
+    return weights_of(logs, top_weight(logs))
+
+
+def log_weights(cloud: GaussianCloud) -> NDArray[np.float64]:
+    """Return the logarithm of opacity times area of every splat, (N,); what is not finite is -inf."""
     logs = np.sort(cloud.log_scales, axis=1)[:, 1:].astype(np.float64)
     with np.errstate(over="ignore"):
         log_opacities = -np.log1p(np.exp(-cloud.opacity_logits.astype(np.float64)))
-    log_weights = np.nan_to_num(logs.sum(axis=1) + log_opacities, nan=-np.inf, posinf=np.inf)
-    top = np.quantile(log_weights, 0.999, method="lower") if np.isfinite(log_weights).any() else 0.0
+    weights: NDArray[np.float64] = np.nan_to_num(logs.sum(axis=1) + log_opacities, nan=-np.inf, posinf=np.inf)
+    return weights
+
+
+def top_weight(logs: NDArray[np.float64]) -> float:
+    """Return the `log_weights` of a whole scene above which all count alike; the order of the splats does not matter."""
+    top = np.quantile(logs, 0.999, method="lower") if np.isfinite(logs).any() else 0.0
     if not np.isfinite(top):
-        top = log_weights[np.isfinite(log_weights)].max(initial=0.0)
-    floor = -np.log(WEIGHT_RANGE)
-    weights: NDArray[np.float32] = np.exp(np.clip(log_weights - top, floor, 0.0)).astype(np.float32)
+        top = logs[np.isfinite(logs)].max(initial=0.0)
+    return float(top)
+
+
+def weights_of(logs: NDArray[np.float64], top: float) -> NDArray[np.float32]:
+    """Return the weights of some splats from their `log_weights` and the `top_weight` of the whole scene."""
+    weights: NDArray[np.float32] = np.exp(np.clip(logs - top, -np.log(WEIGHT_RANGE), 0.0)).astype(np.float32)
     return weights

@@ -36,19 +36,40 @@ def morton_order(means: NDArray[np.float32]) -> Order:
     Order
         (N,) uint32; equal cells (2^-21 of the box an axis) keep their order.
     """
-    from gsplat_tools.kernels.morton import morton_codes
-
     if len(means) == 0:
         return np.zeros(0, np.uint32)
+    return order_of_codes(cell_codes(means, means.min(axis=0), means.max(axis=0)))
+
+
+def cell_codes(means: NDArray[np.float32], low: NDArray[np.float32], high: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Return the Morton code of every point's cell in the box of a scene, of which the points may be a part.
+
+    Parameters
+    ----------
+    means
+        (N, 3) positions, finite.
+    low, high
+        (3,) ends of the box of all points.
+    """
+    from gsplat_tools.kernels.morton import morton_codes
+
     means = np.ascontiguousarray(means, np.float32)
-    low = means.min(axis=0).astype(np.float64)
-    span = means.max(axis=0) - low
+    low = low.astype(np.float64)
+    span = high - low
     with np.errstate(divide="ignore", over="ignore"):
         step = np.where(span > 0, _CELLS / span, 0.0)
     step = np.where(np.isfinite(step), step, 0.0)
     codes = np.empty(len(means), np.uint64)
     run_blocks(lambda start, stop: morton_codes(means, low, step, start, stop, codes), len(means), 1 << 16)
-    return np.argsort(codes, kind="stable").astype(np.uint32)
+    return codes
+
+
+def order_of_codes(codes: NDArray[np.uint64], method: OrderMethod = "morton", layout: tuple[int, int] | None = None) -> Order:
+    """Return what `splat_order` gives, from the cells of all splats instead of the splats."""
+    if method == "none":
+        return np.arange(len(codes), dtype=np.uint32)
+    order = np.argsort(codes, kind="stable").astype(np.uint32)
+    return order if method == "morton" else _along_hilbert(order, layout)
 
 
 def hilbert2d_order(means: NDArray[np.float32], layout: tuple[int, int] | None = None) -> Order:
@@ -71,9 +92,14 @@ def hilbert2d_order(means: NDArray[np.float32], layout: tuple[int, int] | None =
     ValueError
         The layout has fewer pixels than there are points.
     """
+    return _along_hilbert(morton_order(means), layout)
+
+
+def _along_hilbert(path: Order, layout: tuple[int, int] | None) -> Order:
+    """Return the permutation that lays a path through space along a Hilbert path through an image."""
     from gsplat_tools.kernels.morton import hilbert_path
 
-    count = len(means)
+    count = len(path)
     width, height = image_layout(count) if layout is None else layout
     if width * height < count:
         raise ValueError(f"layout {width} x {height} has fewer pixels than {count} splats")
@@ -81,7 +107,7 @@ def hilbert2d_order(means: NDArray[np.float32], layout: tuple[int, int] | None =
     hilbert_path(width, height, xs, ys)
     pixels = ys.astype(np.int64) * width + xs
     order = np.empty(count, np.uint32)
-    order[pixels[pixels < count]] = morton_order(means)
+    order[pixels[pixels < count]] = path
     return order
 
 

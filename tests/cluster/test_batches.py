@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -227,3 +229,22 @@ def test_a_scene_that_ends_its_process__stops_no_other(scenes: Path) -> None:
         engine.close()
     assert sorted(outcomes) == [0, 1, 2, 3]
     assert {index: getattr(outcome, "value", None) for index, outcome in outcomes.items()} == {0: 0, 1: 1, 2: None, 3: 9}
+
+
+def test_processes_that_die_while_tasks_are_handed_in_again__are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    hand_in, calls = ProcessPoolExecutor.submit, []
+
+    def breaks(pool: ProcessPoolExecutor, *words: Any) -> Any:
+        calls.append(words)
+        if len(calls) in (2, 3, 4):
+            raise BrokenProcessPool
+        return hand_in(pool, *words)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", breaks)
+    engine = Processes(1)
+    try:
+        pending = [engine.submit(end_or_return, index) for index in (3, 4)]
+        assert [outcome.value for outcome in engine.results(pending)] == [9, 16]
+    finally:
+        engine.close()
+    assert engine.retried >= 2

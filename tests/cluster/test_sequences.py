@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import time
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,16 @@ def test_tasks__give_the_bytes_of_one_machine(tmp_path: Path, options: dict[str,
 
     assert sha256((tmp_path / "out.sog4d").read_bytes()) == expected == report.cluster["sha256"]
     assert not list(tmp_path.glob(".*"))
+
+
+def test_seconds__add_up_to_what_a_run_took(tmp_path: Path) -> None:
+    pattern = make_frames(tmp_path / "frames", 4, 60)
+    start = time.perf_counter()
+
+    report = convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), **SHORT)
+
+    assert all(spent >= 0 for spent in report.seconds.values()), report.seconds
+    assert 0.5 < sum(report.seconds.values()) / (time.perf_counter() - start) <= 1
 
 
 def test_frames_with_invalid_splats__are_dropped_alike(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gsplat_tools.cluster.blocks import convert_blocks
 from gsplat_tools.cluster.engines import InProcess
 from gsplat_tools.cluster.sequences import convert_sequence
 from gsplat_tools.convert import convert
@@ -202,3 +203,16 @@ def test_reads_here_and_there__give_the_bytes_that_are_there(memory: Any, monkey
                 assert stream.read(size) == data[start : start + size]
         assert stream.seek(-3, 2) == 399_997
         assert stream.read() == data[-3:]
+
+
+def test_a_scene_in_blocks_in_s3__has_the_bytes_of_one_on_the_disk(store: Proxy, tmp_path: Path) -> None:
+    options = {"sh_palette_size": 40, "scale_codebook_size": 60, "webp_effort": 0}
+    save(random_cloud(20_000, sh_degree=1), tmp_path / "a.ply")
+    fsspec.filesystem("s3").put(str(tmp_path / "a.ply"), f"{BUCKET}/a.ply")
+    expected = local_bundle(str(tmp_path / "a.ply"), tmp_path / "local.sog4d", **options)
+
+    report = convert_blocks("s3://bucket/a.ply", "s3://bucket/out.sog4d", InProcess(), block_splats=1, **options)  # type: ignore[arg-type]
+
+    assert report.cluster["blocks"] == 2
+    assert sha256(s3_bytes("out.sog4d")) == expected == report.cluster["sha256"]
+    assert s3_names() == [f"{BUCKET}/a.ply", f"{BUCKET}/out.sog4d"]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gsplat_tools.codecs.palette import fit_palette, nearest_labels, principal_axes
+from gsplat_tools.codecs.vector_search import pilot_rows
 from gsplat_tools.parallel import use_jobs
 from tests.oracles.clustering import nearest
 
@@ -27,6 +28,20 @@ def test_nearest_labels__are_the_nearest(dimensions: int, size: int, rng: np.ran
     _, expected = nearest(points, centroids)
     assert np.allclose(distances, expected, rtol=1e-4, atol=1e-6)
     assert np.allclose(((points - centroids[labels]) ** 2).sum(axis=1), distances, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("spread", [0.01, 1.0])
+def test_nearest_labels__of_pieces_are_those_of_all(spread: float, rng: np.random.Generator) -> None:
+    _, centroids = clusters(1, 15, 1500)
+    points = centroids[rng.integers(0, 1500, 20_000)] + rng.normal(0, spread, (20_000, 15)).astype(np.float32)
+    points[:4096] = rng.normal(0, 3, (4096, 15))  # searched otherwise where they are alone
+    labels, distances = nearest_labels(points, centroids)
+    pilot = points[pilot_rows(len(points))]
+
+    pieces = [nearest_labels(points[start : start + 4096], centroids, pilot=pilot) for start in range(0, len(points), 4096)]
+
+    assert np.array_equal(np.concatenate([found for found, _ in pieces]), labels)
+    assert np.array_equal(np.concatenate([found for _, found in pieces]), distances)
 
 
 def test_nearest_labels__of_equal_centroids_name_one_of_them() -> None:

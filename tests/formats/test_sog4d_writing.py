@@ -15,7 +15,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.codecs.quaternion_u8 import encode_constant_w
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
 from gsplat_tools.formats.sog4d import Sog4dOptions, Sog4dReadOptions, read, write
-from gsplat_tools.formats.sog4d.bounds import rotation_bound
+from gsplat_tools.formats.sog4d.bounds import rotation_bound, scale_reach
 from gsplat_tools.formats.sog4d.codebooks import falling_frames, scale_coordinates, scales_at, turned
 from gsplat_tools.parallel import use_jobs
 from tests.clouds import random_cloud
@@ -265,3 +265,40 @@ def test_refusals__say_why() -> None:
 def test_options__are_checked(options: Any) -> None:
     with pytest.raises(CapabilityError, match=next(iter(options))):
         Sog4dOptions(**options)
+
+
+def test_scales_halfway_between_two_entries__keep_their_bound() -> None:
+    from gsplat_tools.codecs.palette import nearest_labels
+    from gsplat_tools.formats.sog4d.codebooks import points_of, scale_coordinates, scales_at
+
+    rng = np.random.default_rng(0)
+    codebook = -np.sort(-np.exp(rng.uniform(-7, -1, (400, 3))), axis=1).astype(np.float32)
+    pairs = points_of(codebook)[rng.integers(0, len(codebook), (2, 100_000))].astype(np.float64)
+    log_scales = np.log(scales_at(pairs.mean(axis=0).astype(np.float32)))
+    labels = nearest_labels(scale_coordinates(log_scales), points_of(codebook))[0]
+    axes = np.tile(np.arange(3), (len(labels), 1))
+
+    least, largest = scale_reach(log_scales, codebook, labels, axes, is_first=True)
+
+    stored = np.log(codebook.astype(np.float64))[labels]
+    assert ((least <= stored) & (stored <= largest)).all()
+
+
+def test_zeros_of_both_signs__give_one_range() -> None:
+    cloud = random_cloud(50, sh_degree=0)
+    means = np.abs(cloud.means)
+    means[:, 1] = 0
+    texts = []
+    for sign in (1, -1):
+        means[:25, 1] *= np.float32(sign)
+        texts.append(written(cloud.replace(means=means.copy())))
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize("values", [[0.0] * 100, list(range(100)), [5.0, 1.0, 5.0, 5.0, 2.0] * 30, [-np.inf] * 60 + [1.0]])
+def test_long_splats__are_the_first_of_the_longest(values: list[float]) -> None:
+    from gsplat_tools.formats.sog4d.codebooks import LONG_SHARE, longest
+
+    lengths = np.array(values)
+    order = np.argsort(-lengths, kind="stable")[: int(np.ceil(LONG_SHARE * len(lengths)))]
+    assert np.flatnonzero(longest(lengths)).tolist() == sorted(order)

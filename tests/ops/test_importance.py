@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsplat_tools.ops.importance import WEIGHT_RANGE, importance
+from gsplat_tools.ops.importance import WEIGHT_RANGE, importance, log_weights, top_weight, weights_of
 from tests.clouds import random_cloud
 
 
@@ -39,3 +39,10 @@ def test_importance__stays_in_range_whatever_comes() -> None:
     assert weights.min() >= 1 / WEIGHT_RANGE * 0.999
     assert weights[3] == 1
     assert importance(cloud.take(slice(0, 0))).size == 0
+
+
+def test_weights_of_pieces__are_those_of_all() -> None:
+    cloud = random_cloud(3000)
+    logs = [log_weights(cloud.take(slice(start, start + 700))) for start in range(0, 3000, 700)]
+    top = top_weight(np.concatenate(logs[::-1]))
+    assert np.array_equal(np.concatenate([weights_of(part, top) for part in logs]), importance(cloud))

@@ -6,7 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsplat_tools.kernels.morton import hilbert_path, morton_codes
-from gsplat_tools.ops.ordering import hilbert2d_order, image_layout, morton_order, order_splats, splat_order
+from gsplat_tools.ops.ordering import (
+    cell_codes,
+    hilbert2d_order,
+    image_layout,
+    morton_order,
+    order_of_codes,
+    order_splats,
+    splat_order,
+)
 from gsplat_tools.parallel import use_jobs
 from tests.clouds import random_cloud
 from tests.oracles.clustering import morton_code
@@ -95,3 +103,12 @@ def test_splat_order__knows_three_methods() -> None:
 @pytest.mark.parametrize(("count", "layout"), [(0, (1, 1)), (1, (1, 1)), (2, (2, 1)), (4721, (69, 69)), (58649, (243, 242))])
 def test_image_layout__is_nearly_square(count: int, layout: tuple[int, int]) -> None:
     assert image_layout(count) == layout
+
+
+@pytest.mark.parametrize("method", ["morton", "hilbert2d", "none"])
+def test_orders__follow_from_the_cells_of_pieces(method: str, rng: np.random.Generator) -> None:
+    means = rng.normal(0, 1, (5000, 3)).astype(np.float32)
+    low, high = means.min(axis=0), means.max(axis=0)
+    codes = np.concatenate([cell_codes(part, low, high) for part in np.array_split(means, 7)])
+    cloud = random_cloud(5000, sh_degree=0).replace(means=means)
+    assert np.array_equal(order_of_codes(codes, method), splat_order(cloud, method))  # type: ignore[arg-type]

@@ -13,6 +13,7 @@ from gsplat_tools.codecs.rotation_bounds import covariance_bound_of_ranges
 from gsplat_tools.formats.base import Bounds
 from gsplat_tools.formats.sog4d.bundle import Bundle
 from gsplat_tools.formats.sog4d.meta import frame_path
+from gsplat_tools.formats.sog4d.piece import Piece
 from gsplat_tools.formats.sog4d.textures import indices_of, pixels_of
 from gsplat_tools.ops.visibility import MAX_TURN, MOST, allowed_error
 
@@ -52,9 +53,13 @@ def bounds(source: GaussianCloud, stream: BinaryIO, frame: int) -> Bounds:
     FormatError
         The bundle cannot be read.
     """
+    return bounds_in(Bundle(stream), source, frame)
+
+
+def bounds_in(bundle: Bundle | Piece, source: GaussianCloud, frame: int) -> Bounds:
+    """Return the largest errors of one frame of an opened bundle; see `bounds`."""
     from gsplat_tools.codecs.scalar_codebook import nearest_entry
 
-    bundle = Bundle(stream)
     meta = bundle.meta
     low, high = meta.range_min[frame].astype(np.float64), meta.range_max[frame].astype(np.float64)
     means = (high - low) / 65535 / 2 + np.maximum(np.abs(low), np.abs(high)) * _ROUNDING
@@ -160,11 +165,11 @@ def scale_reach(
     distance that a visual tolerance allows beyond the nearest entry.
     """
     from gsplat_tools.codecs.palette import nearest_labels
-    from gsplat_tools.formats.sog4d.codebooks import MIN_LOG, THIN, scale_coordinates
+    from gsplat_tools.formats.sog4d.codebooks import MIN_LOG, THIN, points_of, scale_coordinates
 
     with np.errstate(divide="ignore"):
         logs_of_entries = np.log(codebook.astype(np.float64))
-    entries = scale_coordinates(logs_of_entries.astype(np.float32))
+    entries = points_of(codebook)
     points = scale_coordinates(np.take_along_axis(log_scales, axes, axis=1))
     nearest, squares = nearest_labels(points, entries)
     least = largest = logs_of_entries[nearest]

@@ -111,10 +111,7 @@ class Bundle:
         CorruptDataError
             The file has another size, or holds numbers that are not finite.
         """
-        data = self.archive.read(palette.centroids_path, at_most=2 * centroid_bytes(palette))
-        raise_errors(check_centroids(palette, data), RULES)
-        values = np.frombuffer(data, palette.centroids_dtype).astype(np.float32)
-        return values.reshape(palette.count, palette.coefficients, 3)
+        return centroids_of(palette, self.archive.read(palette.centroids_path, at_most=2 * centroid_bytes(palette)))
 
     def _label_image(self, palette: PaletteMeta, path: str, frame: int) -> Labels:
         labels = indices_of(self.image(path, frame), self.meta.splat_count)
@@ -200,6 +197,19 @@ def _wanted_files(meta: Meta) -> Iterator[tuple[str, int | None]]:
 def centroid_bytes(palette: PaletteMeta) -> int:
     """Return the size of a centroid file."""
     return palette.count * palette.coefficients * 3 * palette.centroids_dtype.itemsize
+
+
+def centroids_of(palette: PaletteMeta, data: bytes) -> NDArray[np.float32]:
+    """Return the entries that a centroid file holds, (K, C, 3).
+
+    Raises
+    ------
+    CorruptDataError
+        The file has another size, or holds numbers that are not finite.
+    """
+    raise_errors(check_centroids(palette, data), RULES)
+    values = np.frombuffer(data, palette.centroids_dtype).astype(np.float32)
+    return values.reshape(palette.count, palette.coefficients, 3)
 
 
 def check_centroids(palette: PaletteMeta, data: bytes) -> list[Issue]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_tools.cloud import GaussianCloud
+from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CloudError
 from gsplat_tools.formats.sog4d import balancing
@@ -56,15 +56,36 @@ class Palette:
     centroids: Float32
     error: float
 
-    def rows(self, cloud: GaussianCloud) -> Float32:
+    def rows(self, shN: Float32) -> Float32:
         """Return what the palette stands for in every splat, (N, 3 C)."""
-        part = cloud.shN[:, self.first : self.first + self.coefficients]
-        return np.ascontiguousarray(part).reshape(len(cloud), 3 * self.coefficients)
+        part = shN[:, self.first : self.first + self.coefficients]
+        return np.ascontiguousarray(part).reshape(len(shN), 3 * self.coefficients)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shared:
-    """Everything that encoding one frame needs besides the frame and the labels before it."""
+    """Everything that encoding one frame needs besides the frame and the labels before it.
+
+    Parameters
+    ----------
+    options
+        Of the bundle.
+    width, height
+        Of the images.
+    bands
+        Highest SH band.
+    scale_codebook, sh0_codebook, palettes
+        As stored.
+    scale_error
+        Mean squared error that the scale codebook leaves.
+    rotation_frames, is_long
+        (N,) of each splat, from the first frame: `falling_frames` and `long_splats`, where the options ask for them.
+    tolerance
+        What may show, or None.
+    pilot
+        (P, K - 1, 3) SH of the splats on which searches are tried, where a frame is encoded in pieces; None where the
+        frame's own are.
+    """
 
     options: Sog4dOptions
     width: int
@@ -77,11 +98,11 @@ class Shared:
     rotation_frames: NDArray[np.uint8] | None = None
     is_long: NDArray[np.bool_] | None = None
     tolerance: Tolerance | None = None
+    pilot: Float32 | None = None
     scale_points: Float32 = field(init=False)
 
     def __post_init__(self) -> None:
-        with np.errstate(divide="ignore"):
-            object.__setattr__(self, "scale_points", scale_coordinates(np.log(self.scale_codebook)))
+        object.__setattr__(self, "scale_points", points_of(self.scale_codebook))
 
 
 @dataclass(slots=True)
@@ -110,13 +131,18 @@ def draw_frame(cloud: GaussianCloud, frame_id: int, num_frames: int, seed: int) 
     """Draw the splats of one frame: the same for the same frame, whatever was drawn elsewhere before."""
     from gsplat_tools.ops.importance import importance
 
-    quota = max(1, SAMPLE_ROWS // num_frames)
+    rows = drawn_rows(len(cloud), frame_id, num_frames, seed)
     weights = importance(cloud)
-    rows: slice | NDArray[np.int64] = slice(None)
-    if len(cloud) > quota:
-        rows = np.sort(np.random.default_rng((seed, frame_id)).permutation(len(cloud))[:quota])
     ends = float(cloud.sh0.min()), float(cloud.sh0.max())
     return FrameSample(cloud.log_scales[rows], cloud.sh0[rows], cloud.shN[rows], weights[rows], ends)
+
+
+def drawn_rows(num_splats: int, frame_id: int, num_frames: int, seed: int) -> NDArray[np.int64]:
+    """Return which splats of a frame are drawn, in their order."""
+    quota = max(1, SAMPLE_ROWS // num_frames)
+    if num_splats <= quota:
+        return np.arange(num_splats)
+    return np.sort(np.random.default_rng((seed, frame_id)).permutation(num_splats)[:quota])
 
 
 def merge_samples(parts: Sequence[FrameSample]) -> Sample:
@@ -144,6 +170,12 @@ def scale_coordinates(log_scales: Float32) -> Float32:
     return coordinates
 
 
+def points_of(scale_codebook: Float32) -> Float32:
+    """Return the coordinates of stored entries, in which labels are chosen and, with the same bits, bounds derived."""
+    with np.errstate(divide="ignore"):
+        return scale_coordinates(np.log(scale_codebook))
+
+
 def scales_at(coordinates: Float32) -> Float32:
     """Return the scales whose coordinates these are, the inverse of `scale_coordinates`."""
     wide = np.exp(coordinates.astype(np.float64))
@@ -154,7 +186,7 @@ def scales_at(coordinates: Float32) -> Float32:
 
 
 def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layout: tuple[int, int]) -> Shared:
-    """Fit codebooks and palettes.
+    """Fit codebooks and palettes, and decide what the first frame decides.
 
     Parameters
     ----------
@@ -167,38 +199,53 @@ def fit_shared(sample: Sample, first: GaussianCloud, options: Sog4dOptions, layo
     layout
         (width, height) of the images.
     """
-    frames = None if options.rotation == "reference" else falling_frames(first)
-    # Axes in the order in which frames put them: hardly any splat changes that order later in a sequence.
-    log_scales = sample.log_scales if frames is None else -np.sort(-sample.log_scales, axis=1)
-    size = options.scale_codebook_size or int(options.detail * default_scale_size(len(first)))
-    codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), size)
+    shared = fit_codebooks(sample, len(first), options, layout)
+    shared = for_splats(shared, first, long_splats(first) if options.rotation == "small" else None)
+    return _balanced(shared, sample, first, options) if options.visual_tolerance > 0 else shared
+
+
+def _balanced(shared: Shared, sample: Sample, first: GaussianCloud, options: Sog4dOptions) -> Shared:
+    """Return codebooks and steps as fine as what they show is worth, where the options leave that open."""
+    tolerance = Tolerance(options.visual_tolerance, viewpoint(first))
+    quats, log_scales = turned(first, shared.rotation_frames)
+    costs = tolerance.costs(first, log_scales)
+    shared = replace(shared, tolerance=tolerance)
+    if options.scale_codebook_size is None:
+        size = balancing.scale_size(shared.scale_points, scale_coordinates(log_scales), costs)
+        codebook, error = _fit_scales(sample, options, size)
+        shared = replace(shared, scale_codebook=codebook, scale_error=error)
+    if options.sh0_entries is None:
+        entries = balancing.color_entries(lambda count: _fit_sh0(sample, count), first.sh0, costs)
+        codebook = BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, entries)
+        shared = replace(shared, sh0_codebook=codebook, options=replace(shared.options, sh0_entries=entries))
+    if options.rotation_steps is None and options.rotation == "small":
+        steps = balancing.rotation_steps(quats, costs)
+        shared = replace(shared, options=replace(shared.options, rotation_steps=steps))
+    return shared
+
+
+def fit_codebooks(sample: Sample, num_splats: int, options: Sog4dOptions, layout: tuple[int, int]) -> Shared:
+    """Fit codebooks and palettes for frames of `num_splats`; nothing about single splats is decided."""
+    bands = REST_COEFFICIENTS.index(sample.shN.shape[1])
+    size = options.scale_codebook_size or int(options.detail * default_scale_size(num_splats))
+    codebook, error = _fit_scales(sample, options, size)
     entries, steps = options.sh0_entries or DEFAULT_SH0_ENTRIES, options.rotation_steps or DEFAULT_ROTATION_STEPS
-    tolerance = Tolerance(options.visual_tolerance, viewpoint(first)) if options.visual_tolerance > 0 else None
-    if tolerance is not None:
-        quats, own_scales = turned(first, frames)
-        costs = tolerance.costs(first, own_scales)
-        if options.scale_codebook_size is None:
-            with np.errstate(divide="ignore"):
-                points = scale_coordinates(np.log(codebook))
-            size = balancing.scale_size(points, scale_coordinates(own_scales), costs)
-            codebook, error = _fit_scales(log_scales, np.sqrt(sample.weights), size)
-        if options.sh0_entries is None:
-            entries = balancing.color_entries(lambda count: _fit_sh0(sample, count), first.sh0, costs)
-        if options.rotation_steps is None and options.rotation == "small":
-            steps = balancing.rotation_steps(quats, costs)
     return Shared(
         options=replace(options, sh0_entries=entries, rotation_steps=steps),
         width=layout[0],
         height=layout[1],
-        bands=first.sh_degree,
+        bands=bands,
         scale_codebook=codebook,
         scale_error=error,
         sh0_codebook=BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, entries),
-        palettes=_fit_palettes(sample, first.sh_degree, len(first), options),
-        rotation_frames=frames,
-        is_long=long_splats(first) if options.rotation == "small" else None,
-        tolerance=tolerance,
+        palettes=_fit_palettes(sample, bands, num_splats, options),
     )
+
+
+def for_splats(shared: Shared, first: GaussianCloud, is_long: NDArray[np.bool_] | None) -> Shared:
+    """Return the same for these splats of the first frame; `is_long` is their part of `long_splats` of all."""
+    frames = None if shared.options.rotation == "reference" else falling_frames(first)
+    return replace(shared, rotation_frames=frames, is_long=is_long)
 
 
 def default_scale_size(num_splats: int) -> int:
@@ -228,10 +275,23 @@ def falling_frames(cloud: GaussianCloud) -> NDArray[np.uint8]:
 
 def long_splats(cloud: GaussianCloud) -> NDArray[np.bool_]:
     """Return which splats are so long and opaque that a small turn shows: a share of LONG_SHARE of all."""
-    lengths = cloud.log_scales.max(axis=1).astype(np.float64) - 0.5 * np.logaddexp(0, -cloud.opacity_logits.astype(np.float64))
-    count = int(np.ceil(LONG_SHARE * len(cloud)))
-    is_long = np.zeros(len(cloud), np.bool_)
-    is_long[np.argsort(-lengths, kind="stable")[:count]] = True
+    return longest(visible_lengths(cloud))
+
+
+def visible_lengths(cloud: GaussianCloud) -> NDArray[np.float64]:
+    """Return the logarithm of how long each splat shows, (N,): its largest scale times the root of its opacity."""
+    lengths: NDArray[np.float64] = cloud.log_scales.max(axis=1).astype(np.float64) - 0.5 * np.logaddexp(
+        0, -cloud.opacity_logits.astype(np.float64)
+    )
+    return lengths
+
+
+def longest(lengths: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which are the LONG_SHARE largest of all; the first come first where some are equal."""
+    count = int(np.ceil(LONG_SHARE * len(lengths)))
+    least = np.partition(lengths, len(lengths) - count)[len(lengths) - count]
+    is_long: NDArray[np.bool_] = lengths > least
+    is_long[np.flatnonzero(lengths == least)[: count - np.count_nonzero(is_long)]] = True
     return is_long
 
 
@@ -246,17 +306,17 @@ def turned(cloud: GaussianCloud, frames: NDArray[np.uint8] | None) -> tuple[Floa
     return quats, log_scales
 
 
-def _fit_scales(log_scales: Float32, weights: Float32, size: int) -> tuple[Float32, float]:
+def _fit_scales(sample: Sample, options: Sog4dOptions, size: int) -> tuple[Float32, float]:
     """Return the scale codebook as stored, and the mean squared error that it leaves."""
     from gsplat_tools.codecs.palette import fit_palette, nearest_labels
 
+    # Axes in the order in which frames put them: hardly any splat changes that order later in a sequence.
+    log_scales = sample.log_scales if options.rotation == "reference" else -np.sort(-sample.log_scales, axis=1)
     points = scale_coordinates(log_scales)
-    centroids = fit_palette(points, weights, size=size, max_rounds=2)
+    centroids = fit_palette(points, np.sqrt(sample.weights), size=size, max_rounds=2)
     error = float(nearest_labels(points, centroids)[1].mean(dtype=np.float64))
     codebook = _on_grid(scales_at(centroids), _SCALE_GRID * np.sqrt(error / 3))
-    with np.errstate(divide="ignore"):
-        stored = scale_coordinates(np.log(codebook))
-    return codebook, float(nearest_labels(points, stored)[1].mean(dtype=np.float64))
+    return codebook, float(nearest_labels(points, points_of(codebook))[1].mean(dtype=np.float64))
 
 
 def _on_grid(codebook: Float32, step: float) -> Float32:

@@ -15,6 +15,7 @@ from gsplat_tools.formats._issues import raise_errors
 from gsplat_tools.formats.sog4d.bundle import Bundle
 from gsplat_tools.formats.sog4d.meta import frame_path
 from gsplat_tools.formats.sog4d.options import ShnOrder, Sog4dReadOptions
+from gsplat_tools.formats.sog4d.piece import Piece
 from gsplat_tools.formats.sog4d.rules import RULES
 from gsplat_tools.formats.sog4d.textures import check_indices, indices_of, pixels_of
 from gsplat_tools.parallel import map_ordered
@@ -69,7 +70,7 @@ def read(stream: BinaryIO, options: Sog4dReadOptions) -> GaussianSequence:
 class FrameDecoder:
     """Frames of a bundle as clouds; palettes and tables are read once."""
 
-    def __init__(self, bundle: Bundle, shn_order: ShnOrder = "interleaved") -> None:
+    def __init__(self, bundle: Bundle | Piece, shn_order: ShnOrder = "interleaved") -> None:
         self.bundle = bundle
         self._shn_order = shn_order
 

@@ -244,8 +244,9 @@ def _meta(
         frame_times=times,
         width=shared.width,
         height=shared.height,
-        range_min=np.array([low for low, _ in ranges]),
-        range_max=np.array([high for _, high in ranges]),
+        # Adding 0 leaves one zero of the two: which of them is the least depends on what comes first.
+        range_min=np.array([low for low, _ in ranges]) + np.float32(0),
+        range_max=np.array([high for _, high in ranges]) + np.float32(0),
         position_hi_path=PATHS["position_hi"],
         position_lo_path=PATHS["position_lo"],
         scale_codebook=shared.scale_codebook,

@@ -1,4 +1,4 @@
-"""One frame to images: a pure function of the frame, what is shared, and the labels before."""
+"""One frame to codes: a pure function of the frame, what is shared, and the labels before."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.formats._webp import Image
 from gsplat_tools.formats.sog4d.codebooks import DEFAULT_ROTATION_STEPS, Shared, scale_coordinates, turned
 from gsplat_tools.formats.sog4d.labels import Labels
-from gsplat_tools.formats.sog4d.textures import index_image, rgba_image
+from gsplat_tools.formats.sog4d.textures import index_columns
 from gsplat_tools.ops.visibility import MOST, VisibleCosts
 
 Float32 = NDArray[np.float32]
@@ -19,12 +18,12 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class FramePlanes:
-    """One frame as images and labels, before compression.
+    """One frame, or a piece of one, as codes.
 
     Parameters
     ----------
-    images
-        RGBA by stream name, labels included.
+    columns
+        (N, 2 to 4) the first bytes of every splat's pixel by stream name, labels included; see `textures.rgba_image`.
     range_min, range_max
         (3,) range of the positions.
     labels
@@ -33,7 +32,7 @@ class FramePlanes:
         Values that the sh0 codebook cannot reach, by what happened to them.
     """
 
-    images: dict[str, Image]
+    columns: dict[str, NDArray[np.uint8]]
     range_min: Float32
     range_max: Float32
     labels: dict[str, Labels]
@@ -48,8 +47,14 @@ class Previous:
     labels: dict[str, Labels]
 
 
-def encode_frame(cloud: GaussianCloud, shared: Shared, previous: Previous | None = None) -> FramePlanes:
-    """Quantize one frame.
+def encode_frame(
+    cloud: GaussianCloud,
+    shared: Shared,
+    previous: Previous | None = None,
+    *,
+    ends: tuple[Float32, Float32] | None = None,
+) -> FramePlanes:
+    """Quantize one frame, or a piece of one.
 
     Parameters
     ----------
@@ -60,11 +65,13 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: Previous | None
     previous
         The frame before in the same segment; None starts a segment. The result depends on its labels alone: splats that
         have not changed keep theirs without a search.
+    ends
+        (3,) least and largest position of the whole frame, for a piece of one. Pieces of a multiple of
+        `parallel.BLOCK_SIZE` splats have the codes that they have in the whole, if there is no tolerance.
     """
     from gsplat_tools.codecs.scalar_codebook import nearest_entry
 
-    width, height = shared.width, shared.height
-    low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
+    low, high = (cloud.means.min(axis=0), cloud.means.max(axis=0)) if ends is None else ends
     codes = position_codes(cloud.means, low, high)
     quats, log_scales = turned(cloud, shared.rotation_frames)
     rotations = rotation_bytes(quats, shared)
@@ -84,27 +91,28 @@ def encode_frame(cloud: GaussianCloud, shared: Shared, previous: Previous | None
         None if costs is None else costs.scale,
         moves=False,
     )
-    images = {
-        "position_hi": rgba_image((codes >> 8).astype(np.uint8), width, height),
-        "position_lo": rgba_image((codes & 0xFF).astype(np.uint8), width, height),
-        "scale_indices": index_image(labels["scale"], width, height),
-        "rotation": rgba_image(rotations, width, height),
-        "sh0": rgba_image(colors, width, height),
+    columns = {
+        "position_hi": (codes >> 8).astype(np.uint8),
+        "position_lo": (codes & 0xFF).astype(np.uint8),
+        "scale_indices": index_columns(labels["scale"]),
+        "rotation": rotations,
+        "sh0": colors,
     }
     for palette in shared.palettes:
-        rows = palette.rows(cloud)
+        rows = palette.rows(cloud.shN)
         labels[palette.name] = choose_labels(
             rows,
             palette.centroids,
             shared.options.keep_tolerance * palette.error,
             None if previous is None else previous.labels[palette.name],
-            None if previous is None else (rows == palette.rows(previous.cloud)).all(axis=1),
+            None if previous is None else (rows == palette.rows(previous.cloud.shN)).all(axis=1),
             None if costs is None else costs.harmonics,
+            pilot=None if shared.pilot is None else palette.rows(shared.pilot),
         )
-        images[f"{palette.name}_labels"] = index_image(labels[palette.name], width, height)
+        columns[f"{palette.name}_labels"] = index_columns(labels[palette.name])
     outside = (cloud.sh0 < shared.sh0_codebook[0]) | (cloud.sh0 > shared.sh0_codebook[-1])
     clipped = {"sh0": int(outside.any(axis=1).sum())} if outside.any() else {}
-    return FramePlanes(images, low, high, labels, clipped)
+    return FramePlanes(columns, low, high, labels, clipped)
 
 
 def relaxed(
@@ -165,15 +173,17 @@ def choose_labels(
     costs: NDArray[np.float64] | None = None,
     *,
     moves: bool = True,
+    pilot: Float32 | None = None,
 ) -> Labels:
     """Return the nearest entry of every splat, or the one it had where that adds at most `tolerance` to the square error.
 
     With costs, the one it had also where the difference hardly shows, and where it had none a frequent entry (if `moves`).
+    `pilot` as `nearest_labels` takes it.
     """
     from gsplat_tools.codecs.palette import nearest_labels
 
     if previous is None:
-        nearest = nearest_labels(points, centroids)[0]
+        nearest = nearest_labels(points, centroids, pilot=pilot)[0]
         if costs is not None and moves:
             from gsplat_tools.codecs.relaxation import relax_labels
 

@@ -21,6 +21,7 @@ from gsplat_tools.formats.sog4d.codebooks import Shared
 from gsplat_tools.formats.sog4d.frame import FramePlanes, Previous, encode_frame
 from gsplat_tools.formats.sog4d.meta import FRAME_TOKEN
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
+from gsplat_tools.formats.sog4d.textures import rgba_image
 
 PATHS = {
     name: f"frames/{FRAME_TOKEN}/{name}.webp" for name in ("position_hi", "position_lo", "scale_indices", "rotation", "sh0")
@@ -64,6 +65,11 @@ def delta_path(name: str, start: int) -> str:
     return f"sh/{name}_delta_{start:05d}.bin"
 
 
+def image_path(name: str, frame_id: int) -> str:
+    """Return the entry of an image."""
+    return f"frames/{frame_id:05d}/{name}.webp"
+
+
 def segment_images(
     load: Callable[[int], GaussianCloud], segment: tuple[int, int], shared: Shared, facts: SegmentFacts, *, uses_deltas: bool
 ) -> Iterator[tuple[str, Image]]:
@@ -92,9 +98,9 @@ def segment_images(
         if uses_deltas and previous is not None:
             for name, blocks in changes.items():
                 blocks.append(label_files.changes(previous.labels[name], planes.labels[name]))
-        for name in sorted(planes.images):
+        for name in sorted(planes.columns):
             if name in PATHS or not uses_deltas or frame_id == start:
-                yield f"frames/{frame_id:05d}/{name}.webp", planes.images[name]
+                yield image_path(name, frame_id), rgba_image(planes.columns[name], shared.width, shared.height)
         previous = Previous(cloud, planes.labels)
     if uses_deltas and previous is not None:
         for palette in shared.palettes:

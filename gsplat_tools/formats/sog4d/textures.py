@@ -19,7 +19,7 @@ def blank(width: int, height: int) -> Image:
 
 
 def rgba_image(codes: NDArray[np.uint8], width: int, height: int) -> Image:
-    """Return an image of (N, 3) or (N, 4) bytes; what is left over is opaque black."""
+    """Return an image of (N, 2), (N, 3) or (N, 4) bytes; what is left over is opaque black."""
     image = blank(width, height)
     image.reshape(-1, 4)[: len(codes), : codes.shape[1]] = codes
     return image
@@ -27,11 +27,12 @@ def rgba_image(codes: NDArray[np.uint8], width: int, height: int) -> Image:
 
 def index_image(indices: NDArray[np.integer[Any]], width: int, height: int) -> Image:
     """Return an image of (N,) numbers of 16 bits: low byte in red, high byte in green."""
-    image = blank(width, height)
-    pixels = image.reshape(-1, 4)
-    pixels[: len(indices), 0] = indices & 0xFF
-    pixels[: len(indices), 1] = indices >> 8
-    return image
+    return rgba_image(index_columns(indices), width, height)
+
+
+def index_columns(indices: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+    """Return the low and the high byte of (N,) numbers of 16 bits, (N, 2)."""
+    return np.stack([indices & 0xFF, indices >> 8], axis=1).astype(np.uint8)
 
 
 def pixels_of(image: Image, count: int) -> NDArray[np.uint8]:
