@@ -32,7 +32,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.codecs.palette import fit_palette, nearest_labels
 from gsplat_tools.codecs.vector_search import one_blas_thread
 from gsplat_tools.errors import GsplatWarning
-from gsplat_tools.formats.sog4d.codebooks import SAMPLE_ROWS
+from gsplat_tools.formats.sog4d.sampling import SAMPLE_ROWS
 from gsplat_tools.ops.importance import importance
 from gsplat_tools.ops.ordering import image_layout, splat_order
 from gsplat_tools.parallel import map_ordered, num_jobs

@@ -27,7 +27,7 @@ from gsplat_tools.codecs import quaternion_u8
 from gsplat_tools.codecs.palette import fit_palette, nearest_labels
 from gsplat_tools.formats import _webp
 from gsplat_tools.formats.sog4d import Sog4dOptions, Sog4dReadOptions, read, write
-from gsplat_tools.formats.sog4d.codebooks import SAMPLE_ROWS
+from gsplat_tools.formats.sog4d.sampling import SAMPLE_ROWS
 from gsplat_tools.ops.importance import importance
 from gsplat_tools.ops.ordering import image_layout, splat_order
 from gsplat_tools.reference.auto_cameras import auto_cameras

@@ -30,8 +30,9 @@ from gsplat_tools.formats._atomic import replacing_in_any_order
 from gsplat_tools.formats._stores import LARGE_BLOCK_BYTES, exists, is_url, replacing_object
 from gsplat_tools.formats.preparing import Fit, SaveChoices
 from gsplat_tools.formats.scanning import Scan, scan_chunks
-from gsplat_tools.formats.sog4d.codebooks import check_finite, drawn_rows, longest, visible_lengths
+from gsplat_tools.formats.sog4d.codebooks import check_finite, longest, visible_lengths
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
+from gsplat_tools.formats.sog4d.sampling import drawn_rows
 from gsplat_tools.ops.importance import log_weights, top_weight
 from gsplat_tools.ops.ordering import OrderMethod, cell_codes, order_of_codes
 

@@ -33,12 +33,13 @@ from gsplat_tools.formats._files import checksum
 from gsplat_tools.formats._webp import Image
 from gsplat_tools.formats._zip import ZipWriter
 from gsplat_tools.formats.sog4d.bounds import bounds_in
-from gsplat_tools.formats.sog4d.codebooks import Sample, Shared, fit_codebooks, for_splats
+from gsplat_tools.formats.sog4d.codebooks import Shared, fit_codebooks, for_splats
 from gsplat_tools.formats.sog4d.decode import FrameDecoder
 from gsplat_tools.formats.sog4d.encode import last_entries
 from gsplat_tools.formats.sog4d.frame import encode_frame
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
 from gsplat_tools.formats.sog4d.piece import Piece, meta_in
+from gsplat_tools.formats.sog4d.sampling import Sample
 from gsplat_tools.formats.sog4d.segments import SegmentFacts, compress_image, image_compression, image_path
 from gsplat_tools.formats.sog4d.textures import blank
 from gsplat_tools.ops.importance import log_weights, weights_of

@@ -24,9 +24,10 @@ from gsplat_tools.formats.preparing import SaveChoices
 from gsplat_tools.formats.preparing_frames import FrameFacts, FrameFit, Kept, decide_fit, fitted_sequence, look_at_frame
 from gsplat_tools.formats.registry import FORMATS
 from gsplat_tools.formats.sequences import check_frame, load_frame
-from gsplat_tools.formats.sog4d.codebooks import FrameSample, Shared, draw_frame, fit_shared, merge_samples
+from gsplat_tools.formats.sog4d.codebooks import Shared, fit_shared
 from gsplat_tools.formats.sog4d.encode import Frames
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
+from gsplat_tools.formats.sog4d.sampling import Sample, draw_frame, merge_samples
 from gsplat_tools.formats.sog4d.segments import (
     SegmentFacts,
     compress_image,
@@ -101,14 +102,14 @@ def decide(source: FrameSource, kept: Kept, choices: SaveChoices) -> FrameFit:
     return decide_fit(source.load(0), kept, FORMAT, choices)
 
 
-def draw_frames(source: FrameSource, start: int, stop: int, fit: FrameFit, seed: int) -> list[FrameSample]:
+def draw_frames(source: FrameSource, start: int, stop: int, fit: FrameFit, seed: int) -> list[Sample]:
     """Return the splats that codebooks are fitted on, frame by frame."""
     frames = Frames(source.fitted(fit))
     return [draw_frame(frames[frame_id], frame_id, len(source.files), seed) for frame_id in range(start, stop)]
 
 
 def fit_codebooks(
-    source: FrameSource, fit: FrameFit, options: Sog4dOptions, layout: tuple[int, int], *parts: list[FrameSample]
+    source: FrameSource, fit: FrameFit, options: Sog4dOptions, layout: tuple[int, int], *parts: list[Sample]
 ) -> Shared:
     """Return what all frames share, from the samples of all frames in their order."""
     sample = merge_samples([each for part in parts for each in part])

@@ -15,10 +15,11 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
 from gsplat_tools.formats._webp import MAX_SIDE, Image
 from gsplat_tools.formats._zip import ZipWriter
-from gsplat_tools.formats.sog4d.codebooks import Palette, Shared, check_finite, draw_sample, fit_shared
+from gsplat_tools.formats.sog4d.codebooks import Palette, Shared, check_finite, fit_shared
 from gsplat_tools.formats.sog4d.decode import GENERATOR
 from gsplat_tools.formats.sog4d.meta import FRAME_TOKEN, Meta, PaletteMeta, Segment, frame_path, meta_text
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
+from gsplat_tools.formats.sog4d.sampling import draw_sample
 from gsplat_tools.formats.sog4d.segments import (
     PATHS,
     SegmentFacts,
