@@ -152,6 +152,9 @@ class Format:
         Changes to the write options for "fast", "balanced" and "best".
     knobs
         Options that trade bytes for accuracy, each with its values from coarsest to finest.
+    sizes
+        Valid cloud and write options to the entries of codebooks that it will be written with, by option; a part of a scene
+        that stands for the whole takes its share of them.
     model
         Reference rendering model and variant that stands for what the format's users see.
     """
@@ -190,6 +193,7 @@ class Format:
     write_options: type = NoOptions
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     knobs: Mapping[str, Knob] = field(default_factory=general_knobs)
+    sizes: Callable[[GaussianCloud, Any], Mapping[str, int]] | None = None
     model: tuple[str, str | None] = ("inria", None)
 
     @property

@@ -1,6 +1,7 @@
 """What a conversion will cost and keep, estimated from a part of the scene before the work is done.
 
-Bytes and seconds of two samples give a straight line in the number of splats. For the pictures, the splats of a sample
+Bytes and seconds of two samples give a straight line in the number of splats; codebooks of a sample have its share of the
+entries that those of the whole scene will have. For the pictures, the splats of a sample
 are put back into the whole scene as they come out of the target: errors of different splats are nearly independent, so
 the squared error of n of N splats is n / N of the whole. The splats that show most are all in the sample and count once,
 because a few large ones decide what is seen.
@@ -10,8 +11,8 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,7 +25,7 @@ from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.loading import open_scene
 from gsplat_tools.formats.preparing import Prepared
 from gsplat_tools.formats.registry import find_format
-from gsplat_tools.formats.saving import SaveReport, count_splats, save
+from gsplat_tools.formats.saving import SaveReport, count_splats, save, split_options
 from gsplat_tools.ops.importance import importance
 from gsplat_tools.ops.sampling import spread_runs
 from gsplat_tools.sequence import GaussianSequence
@@ -106,16 +107,25 @@ def predict(
     first = cloud_of(scene, 0)
     small, large = (spread_runs(first, count) for count in (sampled // 2, sampled))
     taken = min(frames, SAMPLED_FRAMES)
+    sizes = _sizes(first, setting)
+
+    def costs(number: int) -> list[NDArray[np.float64]]:
+        """Return what both samples take with so many frames."""
+        return [
+            _encode(_part(scene, indices, number), _in_proportion(setting, sizes, len(indices) / splats))
+            for indices in (small, large)
+        ]
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GsplatWarning)
         _encode(_part(scene, small, 1), setting)  # compiles
-        sizes = len(small), len(large)
-        few = [_encode(_part(scene, indices, min(frames, 2)), setting) for indices in (small, large)]
-        total = _line(sizes, few, splats)
+        counts = len(small), len(large)
+        few = costs(min(frames, 2))
+        total = _line(counts, few, splats)
         if frames > 2:
-            more = [_encode(_part(scene, indices, taken), setting) for indices in (small, large)]
-            total += _line(sizes, [(m - f) / (taken - 2) for m, f in zip(more, few, strict=True)], splats) * (frames - 2)
-        levels = _levels(cloud_of(scene, frames // 2), large, setting, views, size) if views else []
+            more = costs(taken)
+            total += _line(counts, [(m - f) / (taken - 2) for m, f in zip(more, few, strict=True)], splats) * (frames - 2)
+        levels = _levels(cloud_of(scene, frames // 2), large, setting, sizes, views, size) if views else []
     return Prediction(
         bytes=round(total[0]),
         encode_seconds=float(total[1]),
@@ -126,6 +136,21 @@ def predict(
         sampled_splats=len(large),
         sampled_frames=taken,
     )
+
+
+def _sizes(cloud: GaussianCloud, setting: Setting) -> Mapping[str, int]:
+    """Return the entries of codebooks that the whole scene will be written with, by option."""
+    record = find_format(setting.format)
+    if record.sizes is None:
+        return {}
+    _, options = split_options(record, setting.preset, dict(setting.options))
+    return record.sizes(cloud, options)
+
+
+def _in_proportion(setting: Setting, sizes: Mapping[str, int], share: float) -> Setting:
+    """Return the setting for a part of the scene, with its share of the entries."""
+    own = {name: max(1, round(size * share)) for name, size in sizes.items()}
+    return replace(setting, options={**setting.options, **own})
 
 
 def _line(sizes: tuple[int, int], costs: Sequence[NDArray[np.float64]], splats: int) -> NDArray[np.float64]:
@@ -176,13 +201,20 @@ def _save(scene: Any, folder: Path, setting: Setting, **options: Any) -> SaveRep
     return save(scene, folder / f"sample{record.extensions[0]}", to=record.id, preset=setting.preset, **options)
 
 
-def _levels(cloud: GaussianCloud, runs: NDArray[np.intp], setting: Setting, views: int, size: tuple[int, int]) -> list[float]:
+def _levels(
+    cloud: GaussianCloud,
+    runs: NDArray[np.intp],
+    setting: Setting,
+    sizes: Mapping[str, int],
+    views: int,
+    size: tuple[int, int],
+) -> list[float]:
     """Return the PSNR to be expected in every view that would differ."""
     weights = importance(cloud)
     top = np.argpartition(-weights, int(TOP_SHARE * len(runs)))[: int(TOP_SHARE * len(runs))]
     rest = np.setdiff1d(runs, top)
     chosen = np.union1d(top, rest)
-    decoded, system = _decoded(cloud.take(chosen), setting)
+    decoded, system = _decoded(cloud.take(chosen), _in_proportion(setting, sizes, len(chosen) / len(cloud)))
     bench = Workbench(cloud, views=views, size=size)
     reference = bench.source_frames(system)[0]
     if decoded is None or len(decoded) != len(chosen):  # splats were left out: nothing to put back one by one

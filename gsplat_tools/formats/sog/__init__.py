@@ -99,6 +99,13 @@ def _bounds(source: GaussianCloud, stream: BinaryIO, _frame: int) -> Bounds:
     return bounds(source, stream)
 
 
+def _sizes(cloud: GaussianCloud, options: SogOptions) -> dict[str, int]:
+    """Return the entries of the SH palette, which follow from what they leave."""
+    from gsplat_tools.formats.sog.codebooks import chosen_palette_size
+
+    return {"sh_palette_size": chosen_palette_size(cloud, options)} if cloud.sh_degree else {}
+
+
 FORMAT = Format(
     id="sog",
     title="SOG bundle",
@@ -125,5 +132,6 @@ FORMAT = Format(
         "exact": {"rotation": "best", "sh_palette_size": 65536, "palette_rounds": 8, "webp_effort": 9},
     },
     knobs=KNOBS,
+    sizes=_sizes,
     model=("spark", None),
 )

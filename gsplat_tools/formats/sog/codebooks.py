@@ -110,6 +110,16 @@ def largest_palette_size(num_splats: int) -> int:
     return min(rule, MAX_DEFAULT_PALETTE)
 
 
+def chosen_palette_size(cloud: GaussianCloud, options: SogOptions) -> int:
+    """Return the entries that the SH palette of a cloud with bands above 0 is fitted with."""
+    from gsplat_tools.ops.importance import importance
+
+    if options.sh_palette_size is not None:
+        return options.sh_palette_size
+    rows = sample_rows(cloud, options.seed)
+    return choose_palette_size(cloud.shN.reshape(len(cloud), -1)[rows], np.sqrt(importance(cloud))[rows])
+
+
 def choose_palette_size(points: Float32, weights: Float32) -> int:
     """Return the number of entries from which the mean color error falls below `TARGET_ERROR`, or the largest.
 

@@ -124,6 +124,16 @@ def _repair(source: BinaryIO, target: BinaryIO) -> list[str]:
     return repair(source, target)
 
 
+def _sizes(cloud: GaussianCloud, options: Sog4dOptions) -> dict[str, int]:
+    """Return the entries of codebook and palettes, as far as they are known before a visual tolerance is applied."""
+    from gsplat_tools.formats.sog4d.codebooks import sizes
+
+    found = sizes(len(cloud), options)
+    if options.visual_tolerance > 0 and options.scale_codebook_size is None:
+        del found["scale_codebook_size"]
+    return found
+
+
 FORMAT = Format(
     id="sog4d",
     title=".sog4d sequence bundle",
@@ -160,5 +170,6 @@ FORMAT = Format(
         },
     },
     knobs=KNOBS,
+    sizes=_sizes,
     model=("unity", "fork-4d"),
 )

@@ -171,7 +171,7 @@ def _balanced(shared: Shared, sample: Sample, first: GaussianCloud, options: Sog
 def fit_codebooks(sample: Sample, num_splats: int, options: Sog4dOptions, layout: tuple[int, int]) -> Shared:
     """Fit codebooks and palettes for frames of `num_splats`; nothing about single splats is decided."""
     bands = REST_COEFFICIENTS.index(sample.shN.shape[1])
-    size = options.scale_codebook_size or int(options.detail * default_scale_size(num_splats))
+    size = sizes(num_splats, options)["scale_codebook_size"]
     codebook, error = _fit_scales(sample, options, size)
     entries, steps = options.sh0_entries or DEFAULT_SH0_ENTRIES, options.rotation_steps or DEFAULT_ROTATION_STEPS
     return Shared(
@@ -190,6 +190,14 @@ def for_splats(shared: Shared, first: GaussianCloud, is_long: NDArray[np.bool_] 
     """Return the same for these splats of the first frame; `is_long` is their part of `long_splats` of all."""
     frames = None if shared.options.rotation == "reference" else falling_frames(first)
     return replace(shared, rotation_frames=frames, is_long=is_long)
+
+
+def sizes(num_splats: int, options: Sog4dOptions) -> dict[str, int]:
+    """Return the entries of codebook and palettes by option; a visual tolerance may enlarge a codebook that is not given."""
+    return {
+        "scale_codebook_size": options.scale_codebook_size or int(options.detail * default_scale_size(num_splats)),
+        "sh_palette_size": options.sh_palette_size or int(options.detail * default_palette_size(num_splats)),
+    }
 
 
 def default_scale_size(num_splats: int) -> int:
@@ -300,7 +308,7 @@ def _fit_palettes(sample: Sample, bands: int, num_splats: int, options: Sog4dOpt
     if options.version == 2:
         starts = np.cumsum([0, *BAND_COEFFICIENTS])
         parts = [(f"sh{i + 1}", int(starts[i]), BAND_COEFFICIENTS[i]) for i in range(bands)]
-    size = options.sh_palette_size or int(options.detail * default_palette_size(num_splats))
+    size = sizes(num_splats, options)["sh_palette_size"]
     weights = np.sqrt(sample.weights)
     palettes = []
     for name, first, coefficients in parts:

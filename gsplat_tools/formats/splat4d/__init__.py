@@ -73,6 +73,13 @@ def bounds(source: GaussianCloud, _stream: BinaryIO, _frame: int) -> Bounds:
     return limits
 
 
+def _sizes(cloud: GaussianCloud, options: Splat4dOptions) -> dict[str, int]:
+    """Return the entries of every band's codebook."""
+    from gsplat_tools.formats.splat4d.writing import default_palette_size
+
+    return {"sh_palette_size": options.sh_palette_size or default_palette_size(len(cloud))}
+
+
 FORMAT = Format(
     id="splat4d",
     title=".splat4d asset",
@@ -98,5 +105,6 @@ FORMAT = Format(
         "exact": {"sh_palette_size": 65535, "centroids": "f32"},
     },
     knobs=KNOBS,
+    sizes=_sizes,
     model=("unity", "fork-4d"),
 )
