@@ -73,8 +73,8 @@ FORMAT_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("--level", "level", {"type": click.IntRange(1, 22), "help": "Level of zstd or zlib."}),
     ("--visual-tolerance", "visual_tolerance", {
         "type": options.FiniteType(0, 10), "metavar": "PX",
-        "help": "Move codes to cheap neighbors where no bit saved shows more than an opaque splat shifted by so many px, in a "
-        "picture that the scene spans with 1,000 px; try 0.02 to 0.1. 0 changes nothing.",
+        "help": "Move codes to cheap neighbors, and drop faint splats, where no bit saved shows more than an opaque splat "
+        "shifted by so many px, in a picture that the scene spans with 1,000 px; try 0.02 to 0.1. 0 changes nothing.",
     }),
     ("--seed", "seed", {"type": int, "help": "Seed of everything random."}),
 )  # fmt: skip
