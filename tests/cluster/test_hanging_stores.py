@@ -258,7 +258,10 @@ def test_a_batch__tries_again_what_hung(store: Proxy, source: Path, tmp_path: Pa
 def test_a_signal_while_a_store_hangs__ends_the_command_and_its_uploads(
     store: Proxy, source: Path, scheduler: str, number: int
 ) -> None:
-    command = [sys.executable, "-c", "from gsplat_tools.cli.convert import main; main()", str(source), "s3://bucket/out.spz"]
+    # A shell that runs the tests in the background has SIGINT ignored, which children inherit.
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program += "; from gsplat_tools.cli.convert import main; main()"
+    command = [sys.executable, "-c", program, str(source), "s3://bucket/out.spz"]
     command += ["--no-validate", "--scheduler", scheduler, "--store-timeout", "100"]
     store.reset(on("PUT", "out.spz", "hang"))
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
