@@ -158,9 +158,9 @@ def _balanced(shared: Shared, sample: Sample, first: GaussianCloud, options: Sog
         size = balancing.scale_size(shared.scale_points, scale_coordinates(log_scales), costs)
         codebook, error = _fit_scales(sample, options, size)
         shared = replace(shared, scale_codebook=codebook, scale_error=error)
-    if options.sh0_entries is None:
+    if options.sh0_entries is None and options.sh0_codebook == "fit":
         entries = balancing.color_entries(lambda count: _fit_sh0(sample, count), first.sh0, costs)
-        codebook = BASE_RGB if options.sh0_codebook == "base-rgb" else _fit_sh0(sample, entries)
+        codebook = _fit_sh0(sample, entries)
         shared = replace(shared, sh0_codebook=codebook, options=replace(shared.options, sh0_entries=entries))
     if options.rotation_steps is None and options.rotation == "small":
         steps = balancing.rotation_steps(quats, costs)
