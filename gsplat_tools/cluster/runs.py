@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,9 @@ from gsplat_tools.cluster.outcomes import Outcome
 from gsplat_tools.comparison.attributes import AttributeTally
 from gsplat_tools.comparison.rendered import ViewReport, summarize_views
 from gsplat_tools.convert import ConversionReport
-from gsplat_tools.errors import ClusterError, GsplatWarning, ValidationError
+from gsplat_tools.errors import CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError
+from gsplat_tools.formats._stores import exists, local_path
+from gsplat_tools.formats.saving import find_target
 from gsplat_tools.progress import stage
 from gsplat_tools.verification import Validation
 
@@ -60,6 +63,32 @@ class Stages:
         stage_numbers = self.spent.setdefault(name, {})
         for key, number in numbers.items():
             stage_numbers[key] = round(stage_numbers.get(key, 0) + number, 4)
+
+
+def bundle_target(target: str | Path, to: str | None, what: str, *, overwrite: bool) -> Path:
+    """Return the path of a .sog4d bundle that may be written.
+
+    Parameters
+    ----------
+    target, to, overwrite
+        As `convert` takes them.
+    what
+        What is made of it, for the error about another format.
+
+    Raises
+    ------
+    CapabilityError
+        The target is of another format.
+    TargetExistsError
+        It is there and `overwrite` is false.
+    """
+    target = Path(local_path(target))
+    record = find_target(target, to)
+    if record.id != "sog4d":
+        raise CapabilityError(f"{what}, not {record.title}", path=target)
+    if exists(target) and not overwrite:
+        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=target)
+    return target
 
 
 def fingerprint() -> tuple[dict[str, str], str]:

@@ -18,15 +18,15 @@ from gsplat_tools.cluster.checking import Checks, checks_of
 from gsplat_tools.cluster.engines import Engine
 from gsplat_tools.cluster.outcomes import warn_again
 from gsplat_tools.cluster.parts import Part
-from gsplat_tools.cluster.runs import ClusterReport, Stages, check_alike, judge, key_of
+from gsplat_tools.cluster.runs import ClusterReport, Stages, bundle_target, check_alike, judge, key_of
 from gsplat_tools.convert import unique_warnings
-from gsplat_tools.errors import CapabilityError, GsplatWarning, TargetExistsError
+from gsplat_tools.errors import CapabilityError, GsplatWarning
 from gsplat_tools.formats._limits import max_memory
-from gsplat_tools.formats._stores import exists, is_url, local_path, url_of
+from gsplat_tools.formats._stores import is_url, local_path, url_of
 from gsplat_tools.formats.loading import inspect_file
 from gsplat_tools.formats.preparing import SaveChoices
 from gsplat_tools.formats.preparing_frames import Kept, kept_splats, with_scan
-from gsplat_tools.formats.saving import DEFAULT_PRESET, find_target, split_options
+from gsplat_tools.formats.saving import DEFAULT_PRESET, split_options
 from gsplat_tools.formats.sequences import frame_files
 from gsplat_tools.formats.sog4d.codebooks import Shared
 from gsplat_tools.formats.sog4d.encode import choose_layout, choose_times, last_entries, warn_clipped
@@ -86,12 +86,8 @@ def convert_sequence(
         Workers or the connection to them were lost for good; the same call continues.
     """
     start = time.perf_counter()
-    target = Path(local_path(target))
-    record = find_target(target, None)
-    if record.id != "sog4d":
-        raise CapabilityError(f"a cluster makes one .sog4d bundle of a sequence, not {record.title}", path=target)
-    if exists(target) and not overwrite:
-        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=target)
+    target = bundle_target(target, None, "a cluster makes one .sog4d bundle of a sequence", overwrite=overwrite)
+    record = tasks.FORMAT
     frame_times = options.pop("frame_times", None)
     choices, write_options = split_options(record, preset, options)
     files = frame_files([local_path(each) for each in sources])
