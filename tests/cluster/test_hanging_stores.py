@@ -32,9 +32,11 @@ fsspec = pytest.importorskip("fsspec")
 pytest.importorskip("moto")
 pytestmark = pytest.mark.cluster
 
-TIMEOUT, TRIES = 0.3, 2
-SLACK = 1.5
-"""Seconds that a busy machine may take on top of a bound."""
+TIMEOUT, TRIES = 1.0, 3
+"""Seconds that an answer may take, and times that it is asked for: a busy machine must not look like a store that hangs."""
+
+SLACK = 10.0
+"""Seconds that a busy machine may take on top of a bound; what libraries would wait by themselves is minutes."""
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +208,10 @@ def test_a_store_that_does_not_say_what_is_there__is_not_overwritten(store: Prox
 
 
 @pytest.mark.parametrize("scheduler", ["local", "local:2"])
-def test_a_sequence_meets_a_store_that_hangs__and_continues(store: Proxy, tmp_path: Path, scheduler: str) -> None:
+def test_a_sequence_meets_a_store_that_hangs__and_continues(
+    store: Proxy, tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSPLAT_STORE_TIMEOUT", "600")  # of workers that are not told the time of this run
     pattern = make_frames(tmp_path / "frames", 4, 40)
     expected = local_bundle(pattern, tmp_path / "local.sog4d", **SHORT)
     target = "s3://bucket/out.sog4d"
@@ -228,8 +233,8 @@ def test_a_sequence_meets_a_store_that_hangs__and_continues(store: Proxy, tmp_pa
         assert kept > 0
         assert "out.sog4d" not in names()
     numbers = iter(range(10_000))
-    store.reset(lambda _method, _path, _number: {0: "hang", 5: "stall"}.get(next(numbers) % 10))
-    with ending_within(20.0):  # less than one request of a worker that had not been told the time
+    store.reset(lambda _method, _path, _number: {0: "hang", 10: "stall"}.get(next(numbers) % 20))
+    with ending_within(100.0):
         cluster = run()
     assert store.failed > 0
     assert cluster["kept_segments"] == kept

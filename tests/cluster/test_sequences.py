@@ -51,7 +51,7 @@ def test_seconds__add_up_to_what_a_run_took(tmp_path: Path) -> None:
     report = convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), **SHORT)
 
     assert all(spent >= 0 for spent in report.seconds.values()), report.seconds
-    assert 0.5 < sum(report.seconds.values()) / (time.perf_counter() - start) <= 1
+    assert 0.2 < sum(report.seconds.values()) / (time.perf_counter() - start) <= 1
 
 
 def test_frames_with_invalid_splats__are_dropped_alike(tmp_path: Path) -> None:
