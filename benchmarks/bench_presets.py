@@ -1,4 +1,4 @@
-"""Every preset of every target on one scene of each class, as the rows of docs/tradeoffs.md.
+"""Every preset of every target on one scene of each class: the table of docs/tradeoffs.md.
 
     python benchmarks/bench_presets.py SCENE... [--to ID ...]
 
@@ -27,24 +27,23 @@ def main() -> None:
     parser.add_argument("--to", action="append", choices=list(FORMATS))
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", GsplatWarning)
-    print(describe_machine())
-    for path in arguments.scenes:
+    heads, rows = list[str](), dict[tuple[str, str], dict[int, str]]()
+    for column, path in enumerate(arguments.scenes):
         scene = load(path)
         splats = len(scene) if isinstance(scene, GaussianCloud) else scene.num_splats
-        print(f"\n{path.stem}, {splats:,} splats, SH degree {scene.sh_degree}\n")
-        print("| target | preset | bytes a splat | PSNR min / mean dB | encode s | decode s |")
-        print("|---|---|---|---|---|---|")
-        found = measure_tradeoff(scene, formats=arguments.to or ())
-        for point in found.points:
+        heads.append(f"{path.stem}, {splats:,}: bytes a splat | PSNR min / mean, dB | encode / decode, s")
+        for point in measure_tradeoff(scene, formats=arguments.to or ()).points:
             if point.setting.options or point.likeness is None:
                 continue
             likeness = point.likeness
             level = "identical" if likeness.psnr_min is None else f"{likeness.psnr_min:.1f} / {likeness.psnr_mean:.1f}"
-            print(
-                f"| {point.setting.format} | {point.setting.preset} | {point.bytes_per_splat:.2f} | {level} "
-                f"| {point.encode_seconds:.3f} | {point.decode_seconds:.3f} |",
-                flush=True,
-            )
+            cells = f"{point.bytes_per_splat:.2f} | {level} | {point.encode_seconds:.3f} / {point.decode_seconds:.3f}"
+            rows.setdefault((point.setting.format, point.setting.preset), {})[column] = cells
+    print(describe_machine())
+    print(f"| target | preset | {' | '.join(heads)} |")
+    print("|" + "---|" * (2 + 3 * len(heads)))
+    for (target, preset), cells in rows.items():
+        print(f"| {target} | {preset} | {' | '.join(cells.get(column, ' | | ') for column in range(len(heads)))} |")
 
 
 if __name__ == "__main__":
