@@ -24,6 +24,9 @@ _FULL_SECONDS = 2.0
 _LOOK_SECONDS = 5.0
 """Seconds between two looks whether workers that a task is kept to are still there."""
 
+_REPLACED_SECONDS = 30.0
+"""Seconds within which a worker that died is expected to be replaced, where all others have full disks."""
+
 
 class Dask:
     """Runs tasks on Dask: a cluster of this machine, or one that is running."""
@@ -113,16 +116,27 @@ class Dask:
                 address, key = outcome.full
                 self._full.add(address)
                 self.retried += 1
-                if given is None or self._full.issuperset(self._addresses()):
+                if given is None or not self._has_room():
                     assert outcome.error is not None
                     raise outcome.error
                 arguments = tuple(self._again(each) if getattr(each, "key", "") == key else each for each in given[1])
                 given = (given[0], arguments)
+            else:
+                self._has_room()  # waits for the worker that comes instead; without one, those with full disks try
             assert given is not None
             future = self._submit(*given)
         for each in given[1] if given is not None else ():  # what they were made from may go
             self._given.pop(getattr(each, "key", ""), None)
         return outcome
+
+    def _has_room(self) -> bool:
+        """Whether some worker has room on its disk, those included that come soon in place of others that died."""
+        end = time.monotonic() + _REPLACED_SECONDS
+        while self._full.issuperset(there := self._addresses()):
+            if len(there) >= self.workers or time.monotonic() > end:
+                return False
+            time.sleep(_LOOK_SECONDS / 50)
+        return True
 
     def _again(self, future: Any) -> Any:
         """Hand in again what another task needs, once for all that need it."""

@@ -49,11 +49,17 @@ def test_a_worker_that_is_left_and_dies__does_not_stop_the_run(
     full = next(address for address, facts in engine._client.scheduler_info()["workers"].items() if facts["name"] == 0)
     engine._full.add(full)
     pending = [engine.submit(keep_slowly, str(tmp_path), 3)]
+    alone = threading.Event()
+    addresses = engine._addresses
+    monkeypatch.setattr(engine, "_addresses", lambda: [full] if alone.is_set() else addresses())
 
     def kill() -> None:
         while not (tmp_path / "3.pid").exists():
             time.sleep(0.01)
+        alone.set()  # until the one that died is replaced, nobody is there but the one whose disk is full
         os.kill(int((tmp_path / "3.pid").read_text()), signal.SIGKILL)
+        time.sleep(1)
+        alone.clear()
 
     killer = threading.Thread(target=kill)
     killer.start()
