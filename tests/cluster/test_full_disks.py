@@ -58,7 +58,7 @@ def test_a_worker_that_is_left_and_dies__does_not_stop_the_run(
             time.sleep(0.01)
         alone.set()  # until the one that died is replaced, nobody is there but the one whose disk is full
         os.kill(int((tmp_path / "3.pid").read_text()), signal.SIGKILL)
-        time.sleep(1)
+        time.sleep(4)  # longer than that one takes to say so
         alone.clear()
 
     killer = threading.Thread(target=kill)
