@@ -17,6 +17,8 @@ from gsplat_tools.comparison import attribute_errors
 from gsplat_tools.errors import GsplatError, GsplatWarning
 from gsplat_tools.formats.base import Bounds, Format, Scene
 from gsplat_tools.formats.preparing import SaveChoices, prepare
+from gsplat_tools.numerics import rotations, sizes
+from gsplat_tools.numerics.palettes import palette_limits
 from gsplat_tools.sequence import GaussianSequence
 
 _MOMENTS = (0.0, 0.3, 1.0)
@@ -24,6 +26,18 @@ _MOMENTS = (0.0, 0.3, 1.0)
 
 _FLOAT32_HALF_STEP = 2.0**-24
 """Rounding to float32, relative."""
+
+_COMPANIONS = {rotations.ATTRIBUTE: "covariances", sizes.ATTRIBUTE: "scales"}
+"""Rows that are shown wherever another is: what it leaves open."""
+
+_UNBOUNDED = {
+    "scales": f"a logarithm that becomes or was -inf is infinitely off: see {sizes.ATTRIBUTE!r}",
+    "covariances": f"relative to a covariance that is 0, or beyond float64: see {sizes.ATTRIBUTE!r}",
+    "shN": "labels that are kept from frame to frame, or moved within a tolerance, are not in the file",
+    rotations.ATTRIBUTE: "the covariance errs by as much as its eigenvalues differ, which leaves its axes free",
+    sizes.ATTRIBUTE: "a point gets an extent, or lengths are beyond float64",
+}
+"""Why a value may have no bound."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +167,12 @@ def measure_cloud(
     # What a format clamps or drops beyond its bounds is said beside the row.
     note = ", ".join(done.warnings)
     rows = [judge(name, values, limits.get(name), note=note, **facts) for name, values in errors.items()]
-    return [row for row in rows if names is None or row.attribute in names or row.within is False]
+    return [row for row in rows if names is None or _is_watched(row.attribute, names) or row.within is False]
+
+
+def _is_watched(attribute: str, names: tuple[str, ...]) -> bool:
+    """Whether an attribute, or the one that it accompanies, is among the names."""
+    return attribute in names or _COMPANIONS.get(attribute) in names
 
 
 def _frame(scene: GaussianCloud | GaussianSequence) -> GaussianCloud:
@@ -170,6 +189,18 @@ def compare_clouds(
     if record.bounds is not None:
         stream.seek(0)
         limits = dict(record.bounds(prepared, stream, frame))
+        shN = palette_limits(prepared, decoded, record, stream, frame)
+        if shN is not None:
+            limits["shN"] = shN
+    reach = sizes.covariance_reach(prepared.log_scales, record)
+    if reach is not None and "scales" in limits:
+        limits["scales"] = np.fmin(limits["scales"], sizes.reach_limits(prepared, reach))
+    errors[sizes.ATTRIBUTE] = sizes.size_errors(prepared, decoded)
+    limits[sizes.ATTRIBUTE] = sizes.size_limits(prepared, limits, reach)
+    errors[rotations.ATTRIBUTE] = rotations.rotation_errors(prepared, decoded)
+    turns = rotations.rotation_limits(prepared, record, stream, frame, limits.get("covariances"))
+    if turns is not None:
+        limits[rotations.ATTRIBUTE] = turns
     errors["means"] = attribute_errors(original, decoded)["means"]
     if not np.array_equal(original.origin, prepared.origin) and "means" in limits:
         # Moving the origin rounds each mean once.
@@ -207,12 +238,14 @@ def judge(name: str, errors: NDArray[np.float64], limit: NDArray[Any] | None, *,
     if errors.size == 0:
         return Row(attribute=name, note=note, **facts)
     if limit is None:
+        note = ", ".join(filter(None, [note, f"no bound is known: {_UNBOUNDED.get(name, 'the format states none')}"]))
         return Row(attribute=name, measured_max=_max(errors), measured_rms=_rms(errors), note=note, **facts)
     bounds = np.broadcast_to(np.asarray(limit, np.float64), errors.shape)
     is_bounded = np.isfinite(bounds)
     if not is_bounded.all():
         count = int(np.count_nonzero(~is_bounded))
-        note = ", ".join(filter(None, [note, f"{count} of {bounds.size} values have no bound"]))
+        why = _UNBOUNDED.get(name, "the encoding leaves them open")
+        note = ", ".join(filter(None, [note, f"{count} of {bounds.size} values have no bound ({why})"]))
         if not is_bounded.any():
             return Row(attribute=name, measured_max=_max(errors), measured_rms=_rms(errors), note=note, **facts)
     kept, own = errors[is_bounded], bounds[is_bounded]

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.comparison import attribute_errors
 from gsplat_tools.errors import GsplatError
 from gsplat_tools.formats.base import Bounds, Format
+from gsplat_tools.numerics import rotations, sizes
 from gsplat_tools.numerics.conditions import ordinary
-from gsplat_tools.numerics.measuring import Row, judge, transfer
+from gsplat_tools.numerics.measuring import Row, compare_clouds, judge, transfer
 from gsplat_tools.sequence import GaussianSequence
 
 SWEEP = "sequence"
 
-_WATCHED = ("means", "scales", "covariances", "opacities", "sh0")
+_WATCHED = ("means", "scales", sizes.ATTRIBUTE, rotations.ATTRIBUTE, "covariances", "opacities", "sh0", "shN")
 _CASES: dict[str, tuple[float, ...] | None] = {
     "evenly spaced": None,
     "times repeated": (0.0, 0.5, 0.5, 0.5, 1.0),
@@ -82,9 +82,8 @@ def _all_frames(
     limits: dict[str, list[NDArray[Any]]] = {}
     for index in range(len(source)):
         frame = source.frame(index)
-        stream.seek(0)
-        bounds = {} if record.bounds is None else record.bounds(frame, stream, index)
-        for name, values in attribute_errors(frame, decoded.frame(index)).items():
+        off, bounds = compare_clouds(frame, frame, decoded.frame(index), record, stream, index)
+        for name, values in off.items():
             errors.setdefault(name, []).append(values)
             if name in bounds:
                 limits.setdefault(name, []).append(np.broadcast_to(bounds[name], values.shape))

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import struct
-from itertools import pairwise
 from typing import Any
 
-import mpmath
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,38 +13,14 @@ from hypothesis import strategies as st
 from gsplat_tools.attributes import activations, covariance, quaternions
 from gsplat_tools.attributes.spherical_harmonics import evaluate_colors
 from gsplat_tools.cloud import GaussianCloud
-from gsplat_tools.formats._label_delta import UPDATE, changes
-from gsplat_tools.kernels import rules as R
-from gsplat_tools.reference import models
-from gsplat_tools.reference.rasterizer import render
 from gsplat_tools.reference.sorting import float_to_sortable, sort_pairs
 from gsplat_tools.sequence import GaussianSequence
 from tests.clouds import random_cloud
-from tests.reference.splats import camera, splats
-
-HALF_STEP = 2.0**-24
-"""Largest relative error of one rounding to float32."""
-
-MP = mpmath.mp.clone()
-MP.dps = 60
+from tests.numerics.exact import HALF_STEP, MP, mp_matrix
 
 EXTREMES = np.array(
     [0.0, 1e-45, 1e-40, 1.2e-38, 1e-30, 1e-8, 0.1, 0.5, 1.0, 5.54, 6.23, 16.64, 17.0, 37.0, 40.0, 87.0, 88.7, 103.0, 1e4, 3e38]
 )
-
-
-def mp_matrix(quat: np.ndarray) -> Any:
-    """Rotation matrix of a quaternion of any length."""
-    w, x, y, z = (MP.mpf(float(c)) for c in quat)
-    n = w * w + x * x + y * y + z * z
-    s = 2 / n
-    return MP.matrix(
-        [
-            [1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
-            [s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)],
-            [s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)],
-        ]
-    )
 
 
 # -- activations
@@ -128,101 +102,6 @@ def test_covariances__of_needles_keep_their_thin_axes(aspect: float, rng: np.ran
         assert error <= 16 * 2.0**-53  # of the longest axis, 1
 
 
-# -- projection
-
-
-def project_one(cloud: GaussianCloud, dtype: Any, model: str = "inria") -> tuple[Any, int]:
-    """The record and the state of one splat."""
-    from gsplat_tools.reference._stages import project_scene
-    from gsplat_tools.reference.motion import evaluate_scene
-
-    rules = models.find_model(model, "none" if model == "spark" else None)
-    view = camera(near=1e-30, far=1e30)
-    numbers = models.rule_array(rules, view, dtype, scale_factor=1.0, brightness=1.0)
-    choices = models.choice_array(rules, scale_factor=1.0, gamma_to_linear=False, quantizes=False)
-    projection = project_scene(evaluate_scene(cloud, None, dtype=dtype), view, rules, numbers, choices, None)
-    return projection.records[0].astype(np.float64), int(projection.states[0])
-
-
-def exact_covariance(cloud: GaussianCloud, low_pass: float) -> Any:
-    """The 2 x 2 covariance in pixels, J W R S S R^T W^T J^T + low pass."""
-    x, y, z = (MP.mpf(float(c)) for c in cloud.means[0])
-    f = MP.mpf(100)
-    J = MP.matrix([[f / z, 0, -f * x / z**2], [0, f / z, -f * y / z**2]])
-    rotation = mp_matrix(cloud.quats[0])
-    scales = MP.diag([MP.exp(2 * MP.mpf(float(v))) for v in cloud.log_scales[0]])
-    return J * rotation * scales * rotation.T * J.T + MP.mpf(low_pass) * MP.eye(2)
-
-
-def exact_eigenvalues(sigma: Any) -> tuple[Any, Any]:
-    middle, half = (sigma[0, 0] + sigma[1, 1]) / 2, (sigma[0, 0] - sigma[1, 1]) / 2
-    largest = middle + MP.sqrt(half**2 + sigma[0, 1] ** 2)
-    return largest, (sigma[0, 0] * sigma[1, 1] - sigma[0, 1] ** 2) / largest
-
-
-def eigenvalues_of(record: Any) -> tuple[float, float]:
-    """Eigenvalues in px^2 from q = (s dx + k dy)^2 + (h dy)^2, q half a squared distance."""
-    u = np.hypot(record[R.REC_UX], record[R.REC_UY])
-    v = np.hypot(record[R.REC_VX], record[R.REC_VY])
-    return 0.5 / u**2, 0.5 / v**2
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("aspect", [1.0, 10.0, 1e3, 1e5])
-@pytest.mark.parametrize("size", [1e-8, 1e-3, 1.0, 1e6, 1e15])
-def test_eigenvalues__of_needles_are_exact_at_any_size(dtype: str, aspect: float, size: float) -> None:
-    turn = [np.cos(0.4), 0.1, -0.2, np.sin(0.4)]
-    cloud = splats([[0.3, -0.2, 4.0]], quats=turn, opacities=0.9)
-    cloud = cloud.replace(log_scales=np.log(size) + np.log([[1.0, 1 / aspect, 1 / aspect]]))
-
-    record, state = project_one(cloud, dtype)
-
-    assert state & ~R.EIGENVECTOR_UNDEFINED in (R.DRAWN, R.CULLED)
-    assert state == R.DRAWN
-    exact = exact_eigenvalues(exact_covariance(cloud, 0.3))
-    # Entries of J W R S carry a dozen roundings each, squared in the eigenvalues; the thin one is a quotient of both.
-    half_step = HALF_STEP if dtype == "float32" else 2.0**-53
-    scatter = 64 * half_step
-    for found, expected in zip(eigenvalues_of(record), exact, strict=True):
-        assert abs(MP.mpf(found) - expected) <= scatter * expected
-
-
-@pytest.mark.parametrize("depth", [0.21, 0.2000001, 1e-3, 1e-10, 1e-30])
-def test_projection__near_the_image_plane_is_exact_or_culled(depth: float) -> None:
-    cloud = splats([[0.1 * depth, -0.05 * depth, depth]], scales=0.01 * depth, opacities=0.9)
-
-    for model, least in (("inria", 0.2), ("unity", 0.0)):
-        record, state = project_one(cloud, "float32", model)
-        if depth <= least:
-            assert state == R.CULLED
-            continue
-        assert state & ~R.EIGENVECTOR_UNDEFINED == R.DRAWN
-        assert record[R.REC_X] == pytest.approx(32 + 10, rel=1e-6)
-        assert record[R.REC_Y] == pytest.approx(24 - 5, rel=1e-6)
-        low_pass = models.find_model(model).low_pass
-        exact = exact_eigenvalues(exact_covariance(cloud, low_pass))
-        for found, expected in zip(eigenvalues_of(record), exact, strict=True):
-            assert abs(MP.mpf(found) - expected) <= 64 * HALF_STEP * expected
-
-
-@pytest.mark.parametrize("model", ["inria", "unity", "spark"])
-def test_projection__counts_every_splat_whatever_its_numbers(model: str) -> None:
-    """No splat is lost between the states: it is drawn, culled or invalid."""
-    grid = [10.0**k for k in (-44, -38, -20, -5, 0, 5, 18, 20, 38)]
-    means = np.array([[0.1 * z, 0.0, z] for z in grid for _ in grid])
-    logs = np.array([[np.log(s)] * 3 for _ in grid for s in grid])
-    cloud = splats(means, opacities=0.9).replace(log_scales=logs)
-
-    counts = render(cloud, camera(near=1e-30, far=1e30), model=model, variant="none" if model == "spark" else None).counts
-
-    assert counts.drawn + counts.culled + counts.invalid == counts.splats
-    wide = render(
-        cloud, camera(near=1e-30, far=1e30), model=model, variant="none" if model == "spark" else None, dtype="float64"
-    )
-    # Only what float32 cannot hold is invalid: variances in pixels beyond 3e38.
-    assert wide.counts.invalid == 0
-
-
 # -- keys
 
 
@@ -249,46 +128,6 @@ def test_sort_pairs__of_float_keys_is_the_order_of_floats(values: list[float]) -
     signs = np.signbit(floats)
     expected = sorted(range(len(floats)), key=lambda i: (floats[i], 0 if floats[i] != 0 else 0 if signs[i] else 1))
     assert order.tolist() == expected
-
-
-# -- compositing
-
-
-@pytest.mark.parametrize("model", ["unity", "spark"])
-@pytest.mark.parametrize("opacity", [0.01, 0.5])
-def test_blending__of_a_hundred_thousand_layers_stays_exact(model: str, opacity: float) -> None:
-    count = 100_000
-    colors = np.tile([[0.9, 0.1, 0.5], [0.2, 0.7, 0.5]], (count // 2, 1))
-    depths = np.linspace(5.0, 6.0, count)
-    cloud = splats(np.stack([np.zeros(count), np.zeros(count), depths], axis=1), scales=5.0, opacities=opacity, colors=colors)
-    small = camera(width=4, height=4)
-    variant = "none" if model == "spark" else None
-
-    narrow = render(cloud, small, model=model, variant=variant)
-    wide = render(cloud, small, model=model, variant=variant, dtype="float64")
-
-    # Each layer rounds a few times and hides what came before it by 1 - alpha: a geometric series.
-    alpha = float(opacity) * 0.9
-    bound = 8 * HALF_STEP / alpha
-    assert np.abs(narrow.image - wide.image).max() <= bound
-    # unity caps axes at the size of the picture, so that corners are not covered.
-    assert np.abs(narrow.alphas[1:3, 1:3] - 1).max() <= bound
-
-
-def test_blending__front_to_back_multiplies_transmittance_exactly() -> None:
-    count, opacity = 100_000, 0.005
-    depths = np.linspace(5.0, 6.0, count)
-    cloud = splats(np.stack([np.zeros(count), np.zeros(count), depths], axis=1), scales=500.0, opacities=opacity, colors=1.0)
-
-    rendering = render(cloud, camera(width=2, height=2), model="inria")
-
-    # Drawing stops before the transmittance falls below 1e-4: the exact power of the last layer drawn.
-    alpha = float(activations.sigmoid(cloud.opacity_logits)[0])
-    layers = int(np.floor(np.log(1e-4) / np.log1p(-alpha)))
-    exact = float((1 - MP.mpf(alpha)) ** layers)
-    # Every product rounds 1 - alpha and itself, and the Gaussian falls by 1e-5 over two pixels.
-    assert 1 - rendering.alphas == pytest.approx(np.full((2, 2), exact), rel=4 * layers * HALF_STEP + layers * opacity * 2e-5)
-    assert rendering.image == pytest.approx(rendering.alphas[:, :, None] * np.ones(3), abs=layers * HALF_STEP)
 
 
 # -- spherical harmonics
@@ -365,28 +204,6 @@ def test_log_scales__interpolate_as_geometric_means(a: float, b: float, t: float
 
     exact = (1 - MP.mpf(t)) * MP.mpf(a) + MP.mpf(t) * MP.mpf(b)
     assert abs(MP.mpf(found) - exact) <= HALF_STEP * abs(exact) + (abs(a) + abs(b)) * 2.0**-50
-
-
-def test_label_deltas__do_not_drift_over_ten_thousand_frames(rng: np.random.Generator) -> None:
-    from gsplat_tools.formats._label_delta import DeltaSegment, read_delta, write_delta
-
-    frames, count = 10_000, 50
-    labels = [rng.integers(0, 1000, count).astype(np.uint16)]
-    for _ in range(frames - 1):
-        moved = rng.random(count) < 0.05
-        labels.append(np.where(moved, rng.integers(0, 1000, count), labels[-1]).astype(np.uint16))
-    segment = DeltaSegment(field="d", start_frame=0, frame_count=frames, splat_count=count, label_count=1000)
-    blocks = [changes(before, after) for before, after in pairwise(labels)]
-    data = write_delta(segment, blocks, magic=b"SPL4DLB1")
-
-    found, issues = read_delta(data, segment)
-
-    assert issues == []
-    current = labels[0].copy()
-    for block, expected in zip(found, labels[1:], strict=True):
-        assert block.dtype == UPDATE
-        current[block["splat"]] = block["label"]
-        assert np.array_equal(current, expected)
 
 
 # -- ends of the quantizers

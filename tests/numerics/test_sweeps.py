@@ -42,6 +42,16 @@ def test_format__holds_its_bounds_in_every_sweep(record: Any) -> None:
     assert {"position", "log scale", "needle", "rotation", "opacity logit", "sh0", "SH degree 3", "subnormal"} <= sweeps
     assert ("motion" in sweeps) == record.holds_motion
     assert ("sequence" in sweeps) == record.holds_sequences
+    # Nothing without a bound is left without a reason, and what logarithms cannot say is bounded as a length.
+    unbounded = [row for row in rows if row.within is None]
+    assert [row for row in unbounded if "no bound" not in row.note and not row.note.startswith("refused")] == []
+    measured = {row.condition for row in rows if row.attribute == "scales" and not row.note.startswith("refused")}
+    lengths = {row.condition: row for row in rows if row.attribute == "scales (linear)"}
+    assert set(lengths) == measured
+    # The step of a range that reaches 3e38 is beyond float64.
+    beyond = ["log scale 3e+38"] if record.id == "visionary-i8" else []
+    assert [row.condition for row in lengths.values() if row.within is None] == beyond
+    assert {"rotations (degrees)", "shN"} <= {row.attribute for row in rows if row.within} or record.max_sh_degree == 0
 
 
 def test_conditions__reach_the_extremes() -> None:
@@ -75,7 +85,9 @@ def test_exceeded_rows__notice_a_bound_that_is_half_of_what_it_should_be(attribu
 
     rows = measure_cloud(ordinary(3), dataclasses.replace(record, bounds=halved))
 
-    assert [row.attribute for row in exceeded_rows(rows)] == [attribute]
+    # The bound of lengths follows from that of their logarithms.
+    expected = [attribute, "scales (linear)"] if attribute == "scales" else [attribute]
+    assert [row.attribute for row in exceeded_rows(rows)] == expected
 
 
 def test_refused_clouds__stay_in_the_report() -> None:
@@ -156,7 +168,9 @@ def test_command__prints_json_and_writes_a_plot(tmp_path: Path) -> None:
     assert {row["attribute"] for row in rows if row["format"] == "spz"} == {
         "means",
         "scales",
+        "scales (linear)",
         "covariances",
+        "rotations (degrees)",
         "opacities",
         "sh0",
     }
