@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from gsplat_tools.errors import GsplatError, GsplatWarning
+from gsplat_tools.errors import CapabilityError, GsplatError, GsplatWarning
 from gsplat_tools.formats._stores import local_path, url_of
 from gsplat_tools.formats.base import Format, Scene
 from gsplat_tools.formats.preparing import Prepared
@@ -103,7 +103,7 @@ def convert(
         Search the options that were not given for the cheapest result that holds it; see `tuning.search`.
     auto
         Spend no more than the scene requires: search for fewer bytes than the preset's at pictures as good, as far as a
-        screen shows. Does nothing with a budget, which does as much, and with "exact", which keeps bits.
+        screen shows. Does nothing with a budget, which does as much, and with "exact", which keeps bits and warns.
     validation
         How to check the written file; None checks nothing. What is searched for is judged by as many views as `compare`
         draws, or more.
@@ -125,12 +125,16 @@ def convert(
     ------
     GsplatError
         See `load` and `save`.
+    CapabilityError
+        A budget with the preset "exact", which keeps what a budget gives up.
     ValidationError
         The written file leaves its bounds, renders below `min_psnr`, or nothing holds the budget; the target is left as
         it was.
     """
     sources, target = [local_path(each) for each in sources], local_path(target)
     record = find_target(Path(target), to)
+    if budget is not None and preset == EXACT_PRESET:
+        raise CapabilityError('the preset "exact" keeps all that a format can hold, and a budget gives up some; choose one')
     outcome: dict[str, Any] = {}
     seconds = {"read": 0.0, "encode": 0.0, "write": 0.0, "validate": 0.0}
 
@@ -147,6 +151,8 @@ def convert(
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", GsplatWarning)
+        if auto and preset == EXACT_PRESET:
+            warnings.warn(GsplatWarning("--auto leaves out nothing with the preset exact", code="auto-off"), stacklevel=2)
         start = time.perf_counter()
         in_chunks = record.streams and (options.get("order") or record.order) == "none"
         opening = open_sources(sources, in_chunks=in_chunks, read_options=read_options or {}, options=options)

@@ -103,7 +103,7 @@ def tune(
     if budget is not None:
         tuned.found = searcher.find(budget)
         tuned.options = {**searcher.whole.fixed, **tuned.found.options}
-        tuned.decisions += [_of_search(each) for each in tuned.found.decisions]
+        tuned.decisions += [_of_search(each, budget) for each in tuned.found.decisions]
         return tuned
     usual = searcher.whole.encode({})
     if decisions:
@@ -117,7 +117,7 @@ def tune(
     found = searcher.find(Budget(min_psnr=min(usual.level, VISIBLE_PSNR)))
     if found.bytes < usual.bytes:
         tuned.found, tuned.options = found, {**chosen, **found.options}
-        tuned.decisions += _against_preset(searcher, usual, found)
+        tuned.decisions += _against_preset(searcher, found)
     return tuned
 
 
@@ -176,37 +176,42 @@ def _others(trials: Trials, scene: GaussianCloud | GaussianSequence) -> list[tup
     return others
 
 
-def _of_search(decision: Mapping[str, Any]) -> Decision:
+def _of_search(decision: Mapping[str, Any], budget: Budget) -> Decision:
     """Return a stream's part of a search as a decision."""
-    why = "the cheapest that holds the budget"
-    if decision["next_bytes"] is not None and decision["next_db"] is not None:
-        why += f"; one step finer costs {decision['next_bytes']:,} bytes and brings {decision['next_db']:.2f} dB"
+    held = "of the fewest bytes found that hold it" if budget.min_psnr is not None else "of the best pictures found within it"
     return {
         "option": " ".join(decision["options"]),
         "value": " ".join(map(_short, decision["options"].values())),
         "bytes_saved": None,
         "db_lost": None,
-        "why": why,
+        "why": held + _next_price(decision),
     }
 
 
-def _against_preset(searcher: Searcher, usual: Trial, found: Found) -> list[Decision]:
-    """Return every stream's choice by itself on top of the preset, measured."""
+def _next_price(decision: Mapping[str, Any]) -> str:
+    """Return what the next finer option of a stream is expected to cost."""
+    if decision["next_bytes"] is None or decision["next_db"] is None:
+        return ""
+    return f"; one step finer costs {decision['next_bytes']:,} bytes and brings {decision['next_db']:.2f} dB"
+
+
+def _against_preset(searcher: Searcher, found: Found) -> list[Decision]:
+    """Return every stream's choice held against what the preset has, the others as they were chosen; measured."""
     decisions = []
+    final = searcher.whole.encode(found.options)
     for each in found.decisions:
         try:
-            trial = searcher.whole.encode(each["options"])
+            other = searcher.whole.encode({name: value for name, value in found.options.items() if name not in each["options"]})
         except GsplatError:
-            continue  # only together with the others
-        if trial.bytes == usual.bytes and trial.level == usual.level:
-            continue
-        lost = usual.level - trial.level
+            continue  # the scene does not fit without it
+        lost = other.level - final.level
+        is_same = other.bytes == final.bytes and other.level == final.level
         decisions.append({
             "option": " ".join(each["options"]),
             "value": " ".join(map(_short, each["options"].values())),
-            "bytes_saved": usual.bytes - trial.bytes,
+            "bytes_saved": other.bytes - final.bytes,
             "db_lost": round(lost, 3) if np.isfinite(lost) else None,
-            "why": "measured by itself on top of the preset; errors below what shows are not paid for",
+            "why": ("as the preset has it" if is_same else "against the preset's, all else as chosen") + _next_price(each),
         })  # fmt: skip
     return decisions
 

@@ -25,6 +25,22 @@ _LARGE_ROUNDS = 6
 _STEPS = 4
 """Coarser values of a knob that are tried on top of a preset."""
 
+_MOST_STEPS, _LARGE_STEPS = 16, 4
+"""Choices beside those that nearly hold that are tried."""
+_MOST_FAILED = 3
+"""Of them, beside one, that were not better than the best."""
+_GAIN = 0.995
+"""Share of the bytes of the best choice from which another one is worth trying."""
+_MARGIN = 0.05
+"""dB that are asked for beyond the budget after each that failed."""
+_WORTH_COARSENING = 1.6
+"""Bytes of a preset, of those of what was found, up to which it may come out smaller where splats and codes are coarser."""
+_NEAR_DB = 1.5
+_DB_A_DOUBLING = 8.0
+"""What twice the bytes buy, about: by this, choices of unlike bytes and PSNR are compared."""
+_HIGHEST = 200.0
+"""dB, for pictures that are identical."""
+
 _EXACT = "exact"
 _TINY = 1e-12
 _CLOSE = 0.1
@@ -132,7 +148,7 @@ class Hunt:
                 best = choice, trial
                 if self._is_close(trial):
                     break
-        return self._refined(best or self._extreme(), advance)
+        return self._refined(self._polished(best or self._extreme(), advance), advance)
 
     def _refined(self, best: tuple[Choice, Trial], advance: Callable[[int], None]) -> tuple[Choice, Trial]:
         """Return a choice with fewer splats and coarser codes that holds a PSNR too, where it had some dB to spare."""
@@ -151,25 +167,67 @@ class Hunt:
                 tried = tried[:middle] if holds else tried[middle + 1 :]
         return best
 
-    def preset(self, best: Trial | None) -> tuple[dict[str, Any], Trial, str] | None:
-        """Return the smallest preset that holds a PSNR in no more bytes than what was found, a step coarser where one holds.
+    def _polished(self, best: tuple[Choice, Trial], advance: Callable[[int], None]) -> tuple[Choice, Trial]:
+        """Return the best of what lies two streams away from choices that nearly hold, and of what lies beside that.
 
-        Presets are encoded in their order; only one that is no larger is drawn.
+        Beside a choice that was verified, predictions are much better than over all combinations.
         """
-        if self._budget.min_psnr is None:
-            return None
-        limit = np.inf if best is None else best.bytes
+        failed: dict[tuple[int, ...], int] = {}
+        wanted = self._budget.min_psnr
+        steps = _LARGE_STEPS if self._is_large else _MOST_STEPS
+        while steps and (anchors := [each for each in self._near_budget() if failed.get(each[0].places, 0) < _MOST_FAILED]):
+            anchor = min(anchors, key=lambda each: _price(each[1]))
+            failures = failed.setdefault(anchor[0].places, 0)
+            self._correct(*anchor)
+            goal = best[1].level + _MARGIN if wanted is None else wanted + _MARGIN * failures
+            choice = self._rates.settle(
+                near=anchor[0],
+                min_level=goal if wanted is not None else None,
+                max_bytes=(self._max_bytes if wanted is None else best[1].bytes * _GAIN) / self._ratio,
+                scale=self._scale,
+                avoided=self._verified,
+            )
+            if choice is None or level(choice.errors * self._scale) < goal:
+                failed[anchor[0].places] = _MOST_FAILED
+                continue
+            trial = self._verify(choice)
+            advance(1)
+            steps -= 1
+            if self._holds(trial) and self._is_better(trial, best[1]):
+                best = choice, trial
+            else:
+                failed[anchor[0].places] += 1
+        return best
+
+    def _near_budget(self) -> list[tuple[Choice, Trial]]:
+        """Return what was verified and is not far from the budget on either side."""
+        drawn = [each for each in self._verified.values() if each[1].errors.size and each[1].splats]
+        if self._budget.min_psnr is not None:
+            return [each for each in drawn if abs(each[1].level - self._budget.min_psnr) < _NEAR_DB]
+        return [each for each in drawn if abs(np.log2(each[1].bytes / self._max_bytes)) < _NEAR_DB / _DB_A_DOUBLING]
+
+    def preset(self, best: Trial | None) -> tuple[dict[str, Any], Trial, str] | None:
+        """Return the preset that holds the budget best, codes and splats coarser while a PSNR holds; None if it is no better.
+
+        Presets are encoded in their order; only one is drawn that fits, or is little larger than what was found.
+        """
+        by_psnr = self._budget.min_psnr is not None
+        most = self._max_bytes
+        if by_psnr and best is not None:
+            most = min(most, best.bytes * (1 if self._is_large else _WORTH_COARSENING))
         chosen: tuple[dict[str, Any], Trial, str] | None = None
         for name, changes in self._whole.record.presets.items():
             options = {option: value for option, value in changes.items() if option not in self._whole.fixed}
-            trial = None if name == _EXACT else self._try(options, limit)
+            trial = None if name == _EXACT else self._try(options, most)
             if trial is None:
                 continue
-            if trial.bytes <= limit and self._holds(trial):
-                chosen, limit = (options, trial, f"preset {name}"), trial.bytes
-            if self._is_large and trial.bytes > limit:
+            if trial.bytes <= most and self._holds(trial) and (chosen is None or self._is_better(trial, chosen[1])):
+                chosen, most = (options, trial, f"preset {name}"), min(most, trial.bytes) if by_psnr else most
+            if self._is_large and trial.bytes > most:
                 break
-        return None if chosen is None else self._coarser(*chosen)
+        if chosen is not None and by_psnr:
+            chosen = self._coarser(*chosen)
+        return None if chosen is None or (best is not None and self._is_better(best, chosen[1])) else chosen
 
     def _presets(self) -> list[Trial]:
         """Encode and draw all presets that the format can hold the scene with."""
@@ -296,7 +354,7 @@ class Hunt:
         self._correct(choice, trial)
         decisions = []
         for axis, stream in enumerate(self._rates.streams):
-            smaller, larger = self._rates.neighbours(choice, axis)
+            smaller, larger = self._rates.neighbours(choice, axis, self._scale)
             decisions.append({
                 "stream": stream.name,
                 "options": dict(stream.options[choice.places[axis]]),
@@ -323,3 +381,8 @@ class Hunt:
             bytes_name: round(self._ratio * (fine.bytes - coarse.bytes)),
             db_name: round(float(gain), 3) if np.isfinite(gain) else None,
         }
+
+
+def _price(trial: Trial) -> float:
+    """Return what a trial costs for what it shows, in doublings of bytes."""
+    return float(np.log2(trial.bytes) - min(trial.level, _HIGHEST) / _DB_A_DOUBLING)

@@ -6,7 +6,7 @@ splats, and how bytes are packed, multiply them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -173,6 +173,7 @@ class RateModel:
         wanted: float | None,
         max_bytes: float,
         scale: Errors | float,
+        avoided: Iterable[tuple[int, ...]] = (),
     ) -> Choice | None:
         """Return the best combination of some options of every stream; `wanted` is the largest squared error."""
         shape = tuple(len(each) for each in kept)
@@ -195,6 +196,10 @@ class RateModel:
         else:
             fits = sizes <= max_bytes
             key = worst
+        for places in avoided:
+            found = [np.flatnonzero(rows == place) for rows, place in zip(kept, places, strict=True)]
+            if all(len(each) for each in found):
+                fits[np.ravel_multi_index(tuple(int(each[0]) for each in found), shape)] = False
         if not fits.any():
             return None
         candidates = np.flatnonzero(fits)
@@ -203,9 +208,36 @@ class RateModel:
         places = tuple(int(rows[i]) for rows, i in zip(kept, at, strict=True))
         return Choice(places, float(sizes[best]), np.maximum(errors[at], 0))
 
-    def settle(self, rounds: int = 12, **budget: Any) -> Choice | None:
-        """Return `choose` once every option of it was measured, not predicted."""
-        choice = self.choose(**budget)
+    def choose_near(
+        self,
+        near: Choice,
+        *,
+        min_level: float | None = None,
+        max_bytes: float = np.inf,
+        scale: Errors | float = 1.0,
+        avoided: Collection[tuple[int, ...]] = (),
+    ) -> Choice | None:
+        """Do as `choose`, among the combinations that differ from one in two streams at most, but for those to avoid."""
+        table = self.table()
+        kept = [_undominated(sizes, errors) for sizes, errors in table]
+        wanted = None if min_level is None else 10 ** (-min_level / 10)
+        found = list[Choice]()
+        for pair in combinations(range(len(kept)), min(2, len(kept))):
+            rows = [kept[axis] if axis in pair else np.array([place]) for axis, place in enumerate(near.places)]
+            choice = self._best(table, rows, wanted, max_bytes, scale, avoided)
+            if choice is not None:
+                found.append(choice)
+        if wanted is not None:
+            return min(found, key=lambda each: each.bytes, default=None)
+        return min(found, key=lambda each: (float((each.errors * scale).max(initial=0.0)), each.bytes), default=None)
+
+    def settle(self, rounds: int = 12, near: Choice | None = None, **budget: Any) -> Choice | None:
+        """Return `choose`, or `choose_near` of a choice, once every option of it was measured, not predicted."""
+
+        def choose() -> Choice | None:
+            return self.choose(**budget) if near is None else self.choose_near(near, **budget)
+
+        choice = choose()
         for _ in range(rounds):
             if choice is None:
                 return None
@@ -219,20 +251,19 @@ class RateModel:
                 return choice
             for stream, place in guessed:
                 stream.measure(self._trials, stream.options[place])
-            choice = self.choose(**budget)
+            choice = choose()
         return choice
 
-    def neighbours(self, choice: Choice, axis: int) -> tuple[Choice | None, Choice | None]:
-        """Return the choices with the next smaller and the next larger option of one stream that is worth having."""
+    def neighbours(self, choice: Choice, axis: int, scale: Errors | float) -> tuple[Choice | None, Choice | None]:
+        """Return the choices with the next smaller option of a stream, and the next larger one that helps the worst picture."""
         sizes, errors = self.table()[axis]
         rows = sorted(_undominated(sizes, errors), key=lambda row: sizes[row])
         here = sizes[choice.places[axis]]
-        smaller = [row for row in rows if sizes[row] < here]
-        larger = [row for row in rows if sizes[row] > here]
-        return (
-            self.moved(choice, axis, smaller[-1]) if smaller else None,
-            self.moved(choice, axis, larger[0]) if larger else None,
-        )
+        smaller = [self.moved(choice, axis, row) for row in rows if sizes[row] < here][-1:]
+        larger = (self.moved(choice, axis, row) for row in rows if sizes[row] > here)
+        reached = level(choice.errors * scale)
+        finer = next((each for each in larger if level(each.errors * scale) > reached), None)
+        return (smaller[0] if smaller else None), finer
 
     def moved(self, choice: Choice, axis: int, place: int) -> Choice:
         """Return a choice with another option of one stream."""

@@ -66,6 +66,7 @@ def test_auto__reports_what_it_saved_and_exact_keeps_everything(scene: Path, tmp
     assert any(each["bytes_saved"] for each in auto["decisions"])
     assert exact["search"] is None
     assert exact["decisions"] == []
+    assert "auto-off" in {each["code"] for each in exact["warnings"]}
     assert exact["splats"] == 400
 
 

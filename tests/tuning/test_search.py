@@ -58,6 +58,29 @@ def test_search__asks_more_bytes_for_more_dB_and_fits_into_bytes(searcher: Searc
     assert between.psnr_min > coarse.psnr_min
 
 
+def test_search__within_bytes_is_no_worse_than_a_preset_of_that_size(searcher: Searcher, monkeypatch) -> None:
+    preset = searcher.whole.encode(dict(searcher.whole.record.presets["best"]))
+    assert searcher.find(Budget(max_bytes=preset.bytes)).psnr_min >= preset.level
+
+    monkeypatch.setattr("gsplat_tools.tuning.hunting.Hunt.run", _fail)
+    found = searcher.find(Budget(max_bytes=preset.bytes))
+
+    assert found.psnr_min >= preset.level
+    assert found.bytes <= preset.bytes
+
+
+def test_search__improves_on_what_it_found_by_what_lies_beside_it(scene: GaussianCloud, monkeypatch) -> None:
+    monkeypatch.setattr("gsplat_tools.tuning.hunting.Hunt.preset", lambda *_: None)
+    record = find_format("sog4d")
+    with monkeypatch.context() as patch:
+        patch.setattr("gsplat_tools.tuning.hunting._MOST_STEPS", 0)
+        before = Searcher(scene, record, **SMALL).find(Budget(max_bytes=16_000))
+    after = Searcher(scene, record, **SMALL).find(Budget(max_bytes=16_000))
+
+    assert after.psnr_min > before.psnr_min
+    assert after.bytes <= 16_000
+
+
 def test_search__says_how_close_it_gets(searcher: Searcher) -> None:
     with pytest.raises(ValidationError, match=r"reaches 120 dB: the finest has \d+\.\d\d dB in the worst view at \d+ bytes"):
         searcher.find(Budget(min_psnr=120))
