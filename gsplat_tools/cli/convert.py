@@ -240,7 +240,7 @@ def main(
     from gsplat_tools.parallel import use_jobs
 
     where = cluster.where_of(given)
-    cluster.check_arguments(sources, target, where, dry_run=dry_run)
+    cluster.check_arguments(context, where)
     if where.batch is not None:
         with use_jobs(jobs), output.showing_progress(progress and not quiet):
             cluster.run_manifest(context, where, jobs, _arguments, as_json=as_json, quiet=quiet)
