@@ -165,8 +165,7 @@ def convert_elsewhere(
         asked = _take_searches(own)
         if asked is not None:
             raise CapabilityError(f"{asked} cannot be asked for on a cluster; find options on one machine, then give them")
-        if _take_read_options(own):
-            raise CapabilityError("frames of other tools' bundles are converted on one machine; leave out --scheduler")
+        own.pop("read_options", None)  # which `convert` passes over for frames too
         return convert_sequence(sources, target, engine, parts=where.parts, **own).to_json()
     if record.id == "sog4d":
         try:
@@ -204,7 +203,7 @@ def _convert_blocks(
     asked = _take_searches(arguments)
     if asked is not None:
         raise WholeSceneError(f"{asked} looks at the whole scene")
-    if _take_read_options(arguments):
+    if arguments.pop("read_options", None):
         raise WholeSceneError("sources with read options are read whole")
     size = where.block_splats or DEFAULT_BLOCK_SPLATS
     return convert_blocks(source, target, engine, to=to, parts=where.parts, block_splats=size, **arguments).to_json()
@@ -226,12 +225,6 @@ def _take_searches(arguments: dict[str, Any]) -> str | None:
         "--fit-report": motion is not None and motion.fit_report is not None,
     }  # --tolerance alone does nothing
     return next((option for option, was_asked in asked.items() if was_asked), None)
-
-
-def _take_read_options(arguments: dict[str, Any]) -> bool:
-    """Take read options out of the arguments; return whether one says something else than by default."""
-    given = arguments.pop("read_options", None) or {}
-    return any(value != 0 for name, value in given.items() if name == "lod") or "shn_order" in given
 
 
 def run_manifest(

@@ -335,6 +335,8 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
     )
     if given["min_psnr"] is not None and (validation is None or given["views"] == 0):
         raise click.UsageError("--min-psnr needs --validate and at least one view")
+    if given["auto"] and given["views"] == 0:
+        raise click.UsageError("--auto looks at pictures and needs at least one view; leave out --views 0")
     general = {
         option.name: given[option.name]
         for option in fields(SaveChoices)
