@@ -61,7 +61,8 @@ def cluster_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Convert what a CSV file or JSON lines list (source, target, options); a scene that fails stops no other.",
         ),
         click.option(
-            "--resume", is_flag=True, help="Leave out what a batch has done, where source, options and target are as then."
+            "--resume", is_flag=True,
+            help="Go on with a batch: leave out what it has done, where source, options and target are as then.",
         ),
         click.option(
             "--state", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
@@ -288,7 +289,7 @@ def _summary(summary: dict[str, Any]) -> str:
     return (
         f"{summary['done']} done, {summary['kept']} kept, {summary['failed']} failed; "
         f"{output.count(summary['source_bytes'])} bytes read, {output.count(summary['target_bytes'])} written, "
-        f"{summary['seconds']:.2f} s"
+        f"{summary['seconds']:.2f} s" + ("; the same command with --resume does the rest" if summary["failed"] else "")
     )
 
 
