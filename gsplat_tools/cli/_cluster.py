@@ -323,6 +323,8 @@ def _item(context: click.Context, row: Row, arguments: Arguments) -> Item:
 
 def _words(command: click.Command, name: str, value: Any) -> list[str]:
     """Return an option of a manifest as words of a command line."""
+    if value is None:
+        return []  # null in JSON, as an empty cell
     flag = f"--{name.strip().lstrip('-').replace('_', '-')}"
     option = next((each for each in command.params if flag in (*each.opts, *each.secondary_opts)), None)
     if not isinstance(option, click.Option) or option.name in _OF_THE_COMMAND:

@@ -258,16 +258,18 @@ class _Batch:
         # Workers look: the bytes of targets are read for their hash.
         pending = [self._engine.submit(look_at, *self._remembered(index, resume=resume)) for index in known]
         standing: dict[int, str | None] = {}
-        for position, outcome in self._engine.completed(pending):
-            index = known[position]
-            if isinstance(outcome, Exception):
-                self._fail(index, outcome)
-            elif outcome.error is not None:
-                self._fail(index, outcome.error, outcome.seconds)
-            elif outcome.value.is_done:
-                self._say(index, "kept", outcome.seconds)
-            else:
-                standing[index] = outcome.value.standing
+        with stage("looking at targets", len(known), "scenes") as progress:
+            for position, outcome in self._engine.completed(pending):
+                index = known[position]
+                progress.advance(1)
+                if isinstance(outcome, Exception):
+                    self._fail(index, outcome)
+                elif outcome.error is not None:
+                    self._fail(index, outcome.error, outcome.seconds)
+                elif outcome.value.is_done:
+                    self._say(index, "kept", outcome.seconds)
+                else:
+                    standing[index] = outcome.value.standing
         waiting = [index for index in sorted(standing) if self._may_write(index, standing[index], resume=resume)]
         if self._state is not None:
             self._state.begin({self._targets[index]: standing[index] for index in waiting})

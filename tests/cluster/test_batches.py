@@ -179,8 +179,16 @@ def test_a_state_file_that_was_cut_off__loses_its_last_line(scenes: Path) -> Non
     assert statuses(batch(manifest, "--resume")[1]) == ["kept"] * 3
 
 
-def test_options_of_the_command__hold_for_rows_without_their_own(scenes: Path) -> None:
-    _, report = batch("source,target,sh-degree\ns0.ply,a.ply,\ns1.ply,b.ply,1\n", "--sh-degree", "0")
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        "source,target,sh-degree\ns0.ply,a.ply,\ns1.ply,b.ply,1\n",
+        """{"source": "s0.ply", "target": "a.ply", "options": {"sh-degree": null}}
+        {"source": "s1.ply", "target": "b.ply", "options": {"sh-degree": 1}}""",
+    ],
+)
+def test_options_of_the_command__hold_for_rows_without_their_own(scenes: Path, manifest: str) -> None:
+    _, report = batch(manifest, "--sh-degree", "0")
     assert [item["report"]["sh_degree"] for item in report["items"]] == [0, 1]
 
 
