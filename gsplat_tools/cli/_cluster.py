@@ -13,8 +13,8 @@ import click
 from click.core import ParameterSource
 
 from gsplat_tools.cli import _output as output
-from gsplat_tools.cli._errors import EXIT_DATA, one_line
-from gsplat_tools.errors import CapabilityError, GsplatError
+from gsplat_tools.cli._errors import EXIT_DATA, EXIT_INTERRUPTED, one_line
+from gsplat_tools.errors import CapabilityError, FormatError, GsplatError, TargetExistsError
 from gsplat_tools.formats._stores import is_url, local_path
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.saving import find_target
@@ -61,7 +61,8 @@ def cluster_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Convert what a CSV file or JSON lines list (source, target, options); a scene that fails stops no other.",
         ),
         click.option(
-            "--resume", is_flag=True, help="Leave out what a batch has done, where source, options and target are as then."
+            "--resume", is_flag=True,
+            help="Go on with a batch: leave out what it has done, where source, options and target are as then.",
         ),
         click.option(
             "--state", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
@@ -90,19 +91,37 @@ def where_of(given: dict[str, Any]) -> Where:
     return Where(**{name: given.pop(name) for name in Where.__dataclass_fields__})
 
 
-def check_arguments(sources: tuple[str, ...], target: Path | None, where: Where, *, dry_run: bool) -> None:
-    """Refuse what does not go together."""
-    if dry_run and (where.batch is not None or where.scheduler != LOCAL):
-        raise click.UsageError("--dry-run estimates one conversion on this machine; leave out --batch and --scheduler")
+def check_arguments(context: click.Context, where: Where) -> None:
+    """Refuse what does not go together, or would do nothing."""
+    given = context.params
+    if given["dry_run"] and (where.batch is not None or where.scheduler != LOCAL or where.block_splats is not None):
+        raise click.UsageError(
+            "--dry-run estimates one conversion on this machine; leave out --batch, --scheduler and --block-splats"
+        )
     if where.batch is not None:
-        if sources or target is not None:
-            raise click.UsageError("--batch takes sources and targets from the manifest; leave out SOURCE and TARGET")
-        if where.block_splats is not None:
-            raise click.UsageError("--block-splats is for one scene; a batch converts each of its scenes as one task")
-    elif target is None or not sources:
-        raise click.UsageError(f"Missing argument '{'TARGET' if sources else 'SOURCE...'}'.")
-    elif where.resume or where.state is not None:
+        _check_batch(given, where)
+        return
+    if given["target"] is None or not given["sources"]:
+        raise click.UsageError(f"Missing argument '{'TARGET' if given['sources'] else 'SOURCE...'}'.")
+    if where.resume or where.state is not None:
         raise click.UsageError("--resume and --state belong to --batch; a sequence continues by itself")
+    if where.scheduler == LOCAL and where.block_splats is None:
+        if where.parts is not None:
+            raise click.UsageError("--parts is for tasks, and there are none; give a --scheduler too, or --block-splats")
+        if context.get_parameter_source("retries") is not ParameterSource.DEFAULT:
+            raise click.UsageError("--retries is for tasks, and there are none; give a --scheduler too")
+
+
+def _check_batch(given: dict[str, Any], where: Where) -> None:
+    """Refuse what does not go with --batch."""
+    if given["sources"] or given["target"] is not None:
+        raise click.UsageError("--batch takes sources and targets from the manifest; leave out SOURCE and TARGET")
+    if where.block_splats is not None:
+        raise click.UsageError("--block-splats is for one scene; a batch converts each of its scenes as one task")
+    if where.parts is not None:
+        raise click.UsageError("--parts is for one sequence or scene; a batch converts each of its scenes as one task")
+    if len(given["formats"]) > 1:
+        raise click.UsageError("a row of a batch has one target; give --to once, and further formats as rows of their own")
 
 
 def is_missing(source: str) -> bool:
@@ -121,7 +140,8 @@ def opened(where: Where, jobs: int | None, *, quiet: bool) -> Iterator[Engine | 
     engine = open_engine(where.scheduler, jobs, where.retries)
     try:
         if engine.dashboard and not quiet:
-            click.echo(f"{engine.workers} workers, dashboard {engine.dashboard}", err=True)
+            workers = f"{engine.workers} worker{'s' if engine.workers != 1 else ''}"
+            click.echo(f"{workers}, dashboard {engine.dashboard}", err=True)
         yield engine
     finally:
         engine.close()
@@ -140,11 +160,13 @@ def convert_elsewhere(
     own = dict(arguments)
     is_still = len(sources) == 1 and is_single(Path(local_path(sources[0])))
     if record.id == "sog4d" and not is_still:
+        if where.block_splats is not None:
+            message = "blocks are for one still scene, and this is a sequence, whose tasks are frames; leave out --block-splats"
+            raise CapabilityError(message, path=target)
         asked = _take_searches(own)
         if asked is not None:
             raise CapabilityError(f"{asked} cannot be asked for on a cluster; find options on one machine, then give them")
-        if own.pop("read_options", None):
-            raise CapabilityError("frames of other tools' bundles are converted on one machine")
+        own.pop("read_options", None)  # which `convert` passes over for frames too
         return convert_sequence(sources, target, engine, parts=where.parts, **own).to_json()
     if record.id == "sog4d":
         try:
@@ -154,9 +176,23 @@ def convert_elsewhere(
                 raise
     elif where.block_splats is not None:
         raise CapabilityError(f"blocks are for .sog4d targets, not {record.title}; leave out --block-splats", path=target)
-    item = Item(line=0, sources=sources, target=str(target), arguments={**own, "to": to})
-    outcome = next(engine.results([engine.submit(_convert, item)]))
-    return {**outcome.result(), "cluster": {"scheduler": engine.name, "workers": engine.workers, "dashboard": engine.dashboard}}
+    return _convert_whole(Item(line=0, sources=sources, target=str(target), arguments={**own, "to": to}), engine)
+
+
+def _convert_whole(item: Item, engine: Engine) -> dict[str, Any]:
+    """Convert as one task."""
+    from gsplat_tools.cluster.batches import convert_once, standing_at
+    from gsplat_tools.cluster.runs import check_alike
+    from gsplat_tools.formats._limits import max_memory
+
+    check_alike(engine)
+    located = item.located()
+    if not item.arguments["overwrite"] and standing_at(located) is not None:
+        message = "the target exists; use --overwrite (library: overwrite=True) to replace it"
+        raise TargetExistsError(message, path=item.target)
+    outcome = next(engine.results([engine.submit(convert_once, located, max_memory())]))
+    cluster = {"scheduler": engine.name, "workers": engine.workers, "dashboard": engine.dashboard}
+    return {**item.named(outcome.result()), "cluster": cluster}
 
 
 def _convert_blocks(
@@ -175,36 +211,39 @@ def _convert_blocks(
 
 
 def _take_searches(arguments: dict[str, Any]) -> str | None:
-    """Take what looks at more than stored frames out of the arguments; return the first that was asked for."""
-    from gsplat_tools.retiming import DEFAULT_MOTION
-
-    unset = {"time_at": None, "frame": None, "budget": None, "auto": False, "motion": DEFAULT_MOTION}
-    asked = [name.replace("_at", "") for name, value in unset.items() if arguments.pop(name, value) != value]
+    """Take what looks at more than stored frames out of the arguments; return the option of the first that was asked for."""
     arguments.pop("interpolation", None)
-    return asked[0] if asked else None
-
-
-def _convert(item: Item) -> dict[str, Any]:
-    """Convert, as a task."""
-    from gsplat_tools.convert import convert
-
-    return convert(item.sources, item.target, **item.arguments).to_json()
+    budget, motion = arguments.pop("budget", None), arguments.pop("motion", None)
+    asked = {
+        "--time": arguments.pop("time_at", None) is not None,
+        "--frame": arguments.pop("frame", None) is not None,
+        "--target-psnr": budget is not None and budget.min_psnr is not None,
+        "--max-bytes": budget is not None and budget.max_bytes is not None,
+        "--max-bytes-per-splat": budget is not None and budget.max_bytes_per_splat is not None,
+        "--auto": arguments.pop("auto", False),
+        "--frames": motion is not None and motion.frames is not None,
+        "--fit-motion": motion is not None and motion.fit is not None,
+        "--fit-report": motion is not None and motion.fit_report is not None,
+    }  # --tolerance alone does nothing
+    return next((option for option, was_asked in asked.items() if was_asked), None)
 
 
 def run_manifest(
     context: click.Context, where: Where, jobs: int | None, arguments: Arguments, *, as_json: bool, quiet: bool
 ) -> None:
     """Convert what a manifest lists, and end with a status that tells whether all of it is there."""
-    from gsplat_tools.cluster.batches import STATE_SUFFIX, State, run_batch
-    from gsplat_tools.cluster.manifest import read_manifest
+    from gsplat_tools.cluster.batches import run_batch
+    from gsplat_tools.cluster.state import STATE_SUFFIX, State
 
     assert where.batch is not None
-    items = [_item(context, row, arguments) for row in read_manifest(where.batch)]
+    items = [_item(context, row, arguments) for row in _rows(where.batch)]
     if where.state is None and is_url(where.batch):
         raise click.UsageError("a manifest in a store needs --state FILE")
-    state = State(where.state or Path(f"{local_path(where.batch)}{STATE_SUFFIX}"), resume=where.resume)
+    state = State(where.state or Path(f"{local_path(where.batch)}{STATE_SUFFIX}"))
+    told: list[str] = []
 
     def tell(report: dict[str, Any]) -> None:
+        told.append(report["status"])
         if quiet and report["status"] != "failed":
             return
         text = f"{report['source']} -> {report['target']}"
@@ -213,9 +252,18 @@ def run_manifest(
         elif not as_json:
             click.echo(f"{report['status']}: {text}", err=True)
 
-    with opened(where, jobs, quiet=quiet) as engine:
-        assert engine is not None
-        report = run_batch(items, engine, state=state, resume=where.resume, tell=tell)
+    try:
+        with opened(where, jobs, quiet=quiet) as engine:
+            assert engine is not None
+            report = run_batch(items, engine, state=state, resume=where.resume, tell=tell)
+    except BaseException as error:
+        done = len(told) - told.count("failed")
+        how_far = f"{done} of {len(items)} scenes are done; the same command with --resume continues"
+        if isinstance(error, KeyboardInterrupt):
+            click.echo(f"interrupted; {how_far}", err=True)
+            sys.exit(EXIT_INTERRUPTED)
+        click.echo(how_far, err=True)
+        raise
     if as_json:
         output.print_json(report)
     elif not quiet:
@@ -224,12 +272,24 @@ def run_manifest(
         sys.exit(EXIT_DATA)
 
 
+def _rows(batch: str) -> list[Row]:
+    """Return the rows of a manifest; one that is wrong or missing is a wrong use of the command."""
+    from gsplat_tools.cluster.manifest import read_manifest
+
+    try:
+        return read_manifest(batch)
+    except FileNotFoundError as error:
+        raise click.UsageError(f"there is no manifest {batch}") from error
+    except (FormatError, CapabilityError, IsADirectoryError) as error:
+        raise click.UsageError(f"wrong manifest: {one_line(error)}") from error
+
+
 def _summary(summary: dict[str, Any]) -> str:
     """Return what a batch did in a line."""
     return (
         f"{summary['done']} done, {summary['kept']} kept, {summary['failed']} failed; "
         f"{output.count(summary['source_bytes'])} bytes read, {output.count(summary['target_bytes'])} written, "
-        f"{summary['seconds']:.2f} s"
+        f"{summary['seconds']:.2f} s" + ("; the same command with --resume does the rest" if summary["failed"] else "")
     )
 
 
@@ -256,12 +316,15 @@ def _item(context: click.Context, row: Row, arguments: Arguments) -> Item:
         line=row.line,
         sources=row.sources,
         target=row.target,
+        error=row.error,
         arguments={**found, "to": to, "overwrite": given["overwrite"]},
     )
 
 
 def _words(command: click.Command, name: str, value: Any) -> list[str]:
     """Return an option of a manifest as words of a command line."""
+    if value is None:
+        return []  # null in JSON, as an empty cell
     flag = f"--{name.strip().lstrip('-').replace('_', '-')}"
     option = next((each for each in command.params if flag in (*each.opts, *each.secondary_opts)), None)
     if not isinstance(option, click.Option) or option.name in _OF_THE_COMMAND:

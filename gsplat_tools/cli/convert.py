@@ -240,7 +240,7 @@ def main(
     from gsplat_tools.parallel import use_jobs
 
     where = cluster.where_of(given)
-    cluster.check_arguments(sources, target, where, dry_run=dry_run)
+    cluster.check_arguments(context, where)
     if where.batch is not None:
         with use_jobs(jobs), output.showing_progress(progress and not quiet):
             cluster.run_manifest(context, where, jobs, _arguments, as_json=as_json, quiet=quiet)
@@ -335,6 +335,8 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
     )
     if given["min_psnr"] is not None and (validation is None or given["views"] == 0):
         raise click.UsageError("--min-psnr needs --validate and at least one view")
+    if given["auto"] and given["views"] == 0:
+        raise click.UsageError("--auto looks at pictures and needs at least one view; leave out --views 0")
     general = {
         option.name: given[option.name]
         for option in fields(SaveChoices)

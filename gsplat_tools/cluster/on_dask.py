@@ -85,14 +85,19 @@ class Dask:
             raise
 
     def completed(self, pending: Sequence[Any]) -> Iterator[tuple[int, Outcome | Exception]]:
-        """Wait for the tasks as they end."""
+        """Wait for the tasks as they end; where the caller ends early, those that are not finished are given up."""
         if not pending:
             return
         places = {future.key: index for index, future in enumerate(pending)}
-        with self._client.as_current():
-            ended = self._distributed.as_completed(pending)
-        for future in ended:
-            yield places[future.key], caught(lambda future=future: self._outcome(future))  # type: ignore[misc]
+        try:
+            with self._client.as_current():
+                ended = self._distributed.as_completed(pending)
+            for future in ended:
+                yield places[future.key], caught(lambda future=future: self._outcome(future))  # type: ignore[misc]
+        except BaseException:
+            with suppress(Exception):
+                self._client.cancel(list(pending), force=True)
+            raise
 
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         # Not `allow_other_workers`: workers whose disk is full are idle, and would steal what is kept from them.

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 
 
 def end_or_return(index: int) -> int:
@@ -9,3 +10,9 @@ def end_or_return(index: int) -> int:
     if index == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return index * index
+
+
+def wait_and_return(seconds: float) -> float:
+    """Return the seconds, after so many of them."""
+    time.sleep(seconds)
+    return seconds

@@ -16,7 +16,8 @@ from gsplat_tools.cli.convert import main
 from gsplat_tools.cluster import batches
 from gsplat_tools.cluster.engines import InProcess, Processes
 from gsplat_tools.cluster.manifest import read_manifest
-from gsplat_tools.errors import CapabilityError, CorruptDataError, WriteError
+from gsplat_tools.cluster.state import Done
+from gsplat_tools.errors import CorruptDataError, WriteError
 from gsplat_tools.formats.saving import save
 from tests.clouds import random_cloud
 from tests.cluster.ending import end_or_return
@@ -62,10 +63,22 @@ def test_csv_and_json_lines__say_the_same(scenes: Path) -> None:
     ("text", "said"),
     [
         ("source,target\ns0.ply\n", "line 2: expected as many cells"),
-        ("source,target\ns0.ply,a,b\n", "line 2: expected as many cells"),
+        ("source,target\ns0.ply,a,b\n", "line 2: expected as many cells as the first line has, 2, found 3"),
+        ("\n\nsource,target\n\ns0.ply,a.spz\ns0.ply\n", "line 6: expected as many cells"),
+        ('source,target\n"s\n0.ply",a.spz\ns1.ply\n', "line 4: expected as many cells"),
+        ('source,target\ns0.ply,"a.spz\n\n', "line 2: expected CSV"),
+        ("from,to\ns0.ply,a.spz\n", "line 1: expected a first line with the columns source, target"),
+        ("source,target,preset,preset\ns0.ply,a.spz,best,fast\n", "line 1: column preset stands there twice"),
+        ("source,target\ns0.ply,q.spz\ns1.ply,b/../q.spz\n", "line 3: b/../q.spz is the target of line 2 too"),
+        ("source,target\ns0.ply,q.spz\ns1.ply,{here}/q.spz\n", "line 3: {here}/q.spz is the target of line 2 too"),
+        ("source,target\ns0.ply,q.spz\ns1.ply,file://{here}/q.spz\n", "is the target of line 2 too"),
         ("source,target\n,a.spz\n", "line 2: expected a source and a target"),
         ("source,target\ns0.ply,a.spz\ns1.ply,a.spz\n", "line 3: a.spz is the target of line 2 too"),
         ("source,target\n", "found none"),
+        ("", "found none"),
+        ("source,target\ns0.ply,a\0.spz\n", "line 2: a name holds a zero byte"),
+        ('\n[{"source": "a", "target": "b"}]', "line 2: expected JSON lines, one object a line, and found a list"),
+        ('{"source": "a\u2028b", "target": "b"}\n{"source": 1}', "line 2: expected a source and a target"),
         ('{"source": "a"', "line 1: expected a JSON object"),
         ('{"source": ["a", 1], "target": "b"}', "line 1: expected a source and a target"),
         ('{"source": "a", "target": "b", "preset": "best"}', "line 1: preset belongs into options"),
@@ -73,16 +86,36 @@ def test_csv_and_json_lines__say_the_same(scenes: Path) -> None:
     ],
 )
 def test_manifests_that_are_wrong__name_the_line(scenes: Path, text: str, said: str) -> None:
-    Path("m").write_text(text)
+    Path("m").write_text(text.replace("{here}", str(scenes)))
     with pytest.raises(CorruptDataError) as caught:
         read_manifest("m")
-    assert said in str(caught.value)
+    assert said.replace("{here}", str(scenes)) in str(caught.value)
+    result = CliRunner().invoke(main, ["--batch", "m"])
+    assert result.exit_code == 2
+    assert said.replace("{here}", str(scenes)) in " ".join(result.stderr.split())
 
 
-def test_a_pattern_without_files__is_refused(scenes: Path) -> None:
-    Path("m").write_text("source,target\nx*.ply,{stem}.spz\n")
-    with pytest.raises(CapabilityError, match="no file matches"):
+def test_bytes_that_are_no_text__name_the_line(scenes: Path) -> None:
+    Path("m").write_bytes(b"source,target\ns0.ply,a.spz\ns\xff.ply,b.spz\n")
+    with pytest.raises(CorruptDataError, match="line 3: expected UTF-8"):
         read_manifest("m")
+
+
+def test_a_manifest_that_is_missing__is_a_wrong_use(scenes: Path) -> None:
+    for name in ("none.csv", "."):
+        result = CliRunner().invoke(main, ["--batch", name])
+        assert result.exit_code == 2
+        assert name in result.stderr
+
+
+def test_a_pattern_without_files__fails_alone_and_names_its_line(scenes: Path) -> None:
+    result, report = batch("source,target\nx*.ply,{stem}.spz\ns0.ply,a.spz\ny*.ply,b.spz\n")
+
+    assert statuses(report) == ["failed", "done", "failed"]
+    assert result.exit_code == 1
+    assert report["items"][0]["line"] == 2
+    assert "line 2 of the manifest: no file matches the pattern" in report["items"][0]["error"]["message"]
+    assert "no file matches the pattern" in report["items"][2]["error"]["message"]
 
 
 def test_a_scene_that_fails__stops_no_other(scenes: Path) -> None:
@@ -146,8 +179,16 @@ def test_a_state_file_that_was_cut_off__loses_its_last_line(scenes: Path) -> Non
     assert statuses(batch(manifest, "--resume")[1]) == ["kept"] * 3
 
 
-def test_options_of_the_command__hold_for_rows_without_their_own(scenes: Path) -> None:
-    _, report = batch("source,target,sh-degree\ns0.ply,a.ply,\ns1.ply,b.ply,1\n", "--sh-degree", "0")
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        "source,target,sh-degree\ns0.ply,a.ply,\ns1.ply,b.ply,1\n",
+        """{"source": "s0.ply", "target": "a.ply", "options": {"sh-degree": null}}
+        {"source": "s1.ply", "target": "b.ply", "options": {"sh-degree": 1}}""",
+    ],
+)
+def test_options_of_the_command__hold_for_rows_without_their_own(scenes: Path, manifest: str) -> None:
+    _, report = batch(manifest, "--sh-degree", "0")
     assert [item["report"]["sh_degree"] for item in report["items"]] == [0, 1]
 
 
@@ -197,26 +238,26 @@ def test_other_schedulers__give_the_same_files(scenes: Path, monkeypatch: pytest
     assert not list(Path("kept").iterdir())
     refused = CliRunner().invoke(main, ["f?.ply", "x.sog4d", "--time", "0.5", "--scheduler", "local:3"])
     assert refused.exit_code == 1
-    assert refused.stderr == ("error: time cannot be asked for on a cluster; find options on one machine, then give them\n")
+    assert refused.stderr == ("error: --time cannot be asked for on a cluster; find options on one machine, then give them\n")
 
 
 def test_an_error_that_passes__is_tried_again_and_no_more_often(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
-    def fails_twice(item: batches.Item, memory: int | None) -> Any:
-        calls.append(item.target)
-        if len(calls) < 3 or item.target == "b":
+    def fails_twice(item: batches.Item, options: str, memory: int | None) -> Any:
+        calls.append(Path(item.target).name)
+        if len(calls) < 3 or calls[-1] == "b.spz":
             raise WriteError("busy")
-        return {}, batches.Done(target=item.target, options="", sources=[], bytes=0, sha256=""), 0
+        return {"target": {}}, Done(target=item.target, options=options, sources=[], bytes=0, sha256=""), 0
 
     monkeypatch.setattr(batches, "convert_item", fails_twice)
     monkeypatch.setattr("gsplat_tools.cluster.engines._FIRST_PAUSE", 0)
-    items = [batches.Item(line=1, sources=("s0.ply",), target=target) for target in ("a", "b")]
+    items = [batches.Item(line=1, sources=("s0.ply",), target=target) for target in ("a.spz", "b.spz")]
 
     report = batches.run_batch(items, InProcess(retries=2))
 
     assert statuses(report) == ["done", "failed"]
-    assert calls == ["a"] * 3 + ["b"] * 3
+    assert calls == ["a.spz"] * 3 + ["b.spz"] * 3
     assert report["cluster"]["retried"] == 4
 
 

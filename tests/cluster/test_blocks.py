@@ -371,7 +371,7 @@ def test_the_command__takes_blocks_where_it_can(scenes: Path, tmp_path: Path) ->
     assert data("d.sog4d") == data("e.sog4d")
     for words, said in (
         (["--visual-tolerance", "0.01"], "a visual tolerance weighs"),
-        (["--target-psnr", "30", "--views", "1"], "budget looks at the whole scene"),
+        (["--target-psnr", "30", "--views", "1"], "--target-psnr looks at the whole scene"),
     ):
         code, error = run("f.sog4d", "--block-splats", "500", *words)
         assert code == 1
