@@ -81,6 +81,10 @@ class CodePart:
     seconds: dict[str, float] = field(default_factory=dict)
     kept: bool = False
 
+    def column_bytes(self, name: str) -> int:
+        """Return the bytes of the codes of one image."""
+        return self.count * self.columns[name][1]
+
     def column(self, name: str) -> NDArray[np.uint8]:
         """Return the codes of one image, (count, bytes a splat).
 
@@ -90,7 +94,7 @@ class CodePart:
             They went missing, or are not those that were written.
         """
         offset, width, expected = self.columns[name]
-        data = b"".join(part_bytes(self.path, offset, self.count * width))
+        data = b"".join(part_bytes(self.path, offset, self.column_bytes(name)))
         if checksum(data) != expected:
             raise ClusterError("a finished block was changed; the same command makes it anew", path=self.path)
         return np.frombuffer(data, np.uint8).reshape(self.count, width)

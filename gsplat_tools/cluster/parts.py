@@ -136,6 +136,11 @@ class Part:
     seconds: dict[str, float] = field(default_factory=dict)
     kept: bool = False
 
+    @property
+    def stored_size(self) -> int:
+        """Bytes of all entries."""
+        return max(entry.offset + entry.stored_size for entry in self.entries)
+
     def to_json(self) -> dict[str, Any]:
         """Return what the file says about itself."""
         facts = self.facts

@@ -153,6 +153,35 @@ def test_checks__are_those_of_one_machine(scenes: Path, tmp_path: Path) -> None:
             assert others[name][kind] == (None if value is None else pytest.approx(value, rel=1e-9)), (name, kind)
 
 
+def test_stages__tell_the_bytes_that_they_moved(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: dict[str, int] = {}
+    monkeypatch.setattr(blocks, "remove_parts", lambda folder: sizes.update(
+        {path.name: path.stat().st_size for path in Path(folder).iterdir()}
+    ))  # fmt: skip
+    source, options = scenes / "1.ply", {**QUICK, "validation": Validation(), "prune_faint": 0.01}
+    report = in_blocks(source, tmp_path / "out.sog4d", **options)
+    stages, read = report.cluster["stages"], source.stat().st_size
+    rows = next(size for name, size in sizes.items() if name.startswith("rows"))
+    written = {
+        "arrange": sum(size for name, size in sizes.items() if name.startswith(("rows", "scene"))),
+        "encode": sum(size for name, size in sizes.items() if name[:6].isdecimal()),
+        "compress": sum(size for name, size in sizes.items() if not name.startswith(("rows", "scene", "0"))),
+    }
+
+    assert stages["look"]["bytes_read"] == stages["arrange"]["bytes_read"] == 2 * read
+    assert stages["encode"]["bytes_read"] == rows
+    assert stages["compress"]["bytes_read"] == stages["encode"]["bytes_written"]
+    assert stages["fit"]["bytes_read"] == stages["arrange"]["bytes_written"] - 2 * rows  # without those for pictures
+    assert stages["draw"]["bytes_read"] == rows + stages["encode"]["bytes_written"]  # all splats are drawn
+    assert stages["assemble"]["bytes"] == report.bytes
+    for name, size in written.items():
+        assert 0 < size - stages[name]["bytes_written"] < 30_000, name  # what parts say about themselves
+
+    again = in_blocks(source, tmp_path / "out.sog4d", overwrite=True, **options).cluster["stages"]
+    for name in written:
+        assert "bytes_written" not in again[name], name
+
+
 def test_pictures_of_large_scenes__show_every_so_manieth_splat(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

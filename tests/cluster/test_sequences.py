@@ -54,6 +54,23 @@ def test_seconds__add_up_to_what_a_run_took(tmp_path: Path) -> None:
     assert 0.2 < sum(report.seconds.values()) / (time.perf_counter() - start) <= 1
 
 
+def test_stages__tell_the_bytes_that_they_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pattern = make_frames(tmp_path / "frames", 7, 60)
+    monkeypatch.setattr("gsplat_tools.cluster.sequences.remove_parts", lambda folder: None)
+    first = convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), **SHORT)  # type: ignore[arg-type]
+    source = sum(path.stat().st_size for path in (tmp_path / "frames").iterdir())
+    parts = parts_of(tmp_path / "out.sog4d")
+    parts[1].unlink()
+    again = convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), overwrite=True, **SHORT)  # type: ignore[arg-type]
+
+    one, two = first.cluster["stages"], again.cluster["stages"]
+    assert one["look"]["bytes_read"] == one["fit"]["bytes_read"] == source
+    assert one["encode"]["bytes_read"] == 2 * source
+    assert two["encode"]["bytes_read"] == pytest.approx(2 * source * 3 / 7)  # the second segment alone
+    assert 0 < two["encode"]["bytes_written"] < one["encode"]["bytes_written"]
+    assert one["assemble"]["bytes"] == first.bytes
+
+
 def test_frames_with_invalid_splats__are_dropped_alike(tmp_path: Path) -> None:
     for index, cloud in enumerate(moving(100, 5, sh_degree=1)):
         means = cloud.means.copy()
