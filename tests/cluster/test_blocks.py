@@ -376,6 +376,9 @@ def test_sources_that_are_read_whole_and_other_targets__are_refused(scenes: Path
         in_blocks(tmp_path / "pipe", tmp_path / "out.sog4d")
     with pytest.raises(CapabilityError, match=r"becomes a \.sog4d bundle"):
         in_blocks(scenes / "0.ply", tmp_path / "out.spz")
+    with pytest.raises(WriteError, match="make it first"):
+        in_blocks(scenes / "0.ply", tmp_path / "missing/out.sog4d")
+    assert not (tmp_path / "missing").exists()
     with pytest.raises(CapabilityError, match="at least one splat"):
         in_blocks(scenes / "0.ply", tmp_path / "out.sog4d", block_splats=0)
 

@@ -205,6 +205,9 @@ def test_what_cannot_be_done__is_refused_before_work(tmp_path: Path) -> None:
     (tmp_path / "there.sog4d").write_bytes(b"")
     with pytest.raises(TargetExistsError):
         convert_sequence([pattern], tmp_path / "there.sog4d", InProcess())
+    with pytest.raises(WriteError, match="make it first"):
+        convert_sequence([pattern], tmp_path / "missing/out.sog4d", InProcess())
+    assert not (tmp_path / "missing").exists()
     with pytest.raises(CapabilityError, match="a cluster makes"):
         convert_sequence([pattern], tmp_path / "out.spz", InProcess())
     with pytest.raises(CapabilityError, match="unknown scheduler"):
