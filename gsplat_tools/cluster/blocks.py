@@ -261,9 +261,8 @@ class _Job:
         for index in range(len(arrangement.digests)):
             own = self._own(f"block {index}")
             path = f"{self.folder}/{index:06d}-{own[:16]}.part"
-            pending.append(
-                submit(block_tasks.encode_block, arrangement, self._shared, index, path, own, self.checks is not None)
-            )
+            arguments = (arrangement, self._shared, index, path, own, self.stages.run_id, self.checks is not None)
+            pending.append(submit(block_tasks.encode_block, *arguments))
             sizes.append(arrangement.size_of(index))
         found: list[CodePart] = list(self.stages.run("encode", "encoding", pending, sizes, "splats"))
         for block in found:
@@ -277,7 +276,7 @@ class _Job:
         for name in names:
             own = self._own(f"image {name}")
             path = f"{self.folder}/{name}-{own[:16]}.part"
-            arguments = (name, blocks, self.layout, self.options, path, own, self.checks is not None)
+            arguments = (name, blocks, self.layout, self.options, path, own, self.stages.run_id, self.checks is not None)
             pending.append(self.stages.engine.submit(block_tasks.compress_plane, *arguments))
         found: list[Part] = list(
             self.stages.run("compress", "compressing", pending, [arrangement.num_splats] * len(names), "pixels")

@@ -7,7 +7,9 @@ import itertools
 import logging
 import queue
 import re
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, wait
 from contextlib import ExitStack, contextmanager, suppress
@@ -27,6 +29,9 @@ _FULL_SECONDS = 2.0
 
 _LOOK_SECONDS = 5.0
 """Seconds between two looks whether workers are still there, while a task is waited for."""
+
+_FAILED_TOPIC = "gsplat_tools-failed"
+"""Of events: keys of tasks that failed and may be tried again."""
 
 _GONE_SECONDS = 60.0
 """Seconds without any worker after which none is expected any more."""
@@ -52,6 +57,9 @@ class Dask:
         self.name = address
         self.retried = 0
         self._full: set[str] = set()
+        self._keys: set[str] = set()
+        self._failed: Counter[str] = Counter()
+        self._counting = threading.Lock()  # events are taken by another thread
         self._given: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
         self._instead: dict[str, Any] = {}
         self._kept_to: dict[str, list[str]] = {}
@@ -90,6 +98,8 @@ class Dask:
         self._settings = Settings(jobs)
         self.workers = len(self._addresses())
         self.dashboard = self._client.dashboard_link
+        self._client.subscribe_topic("all", self._take_event)
+        self._client.subscribe_topic(_FAILED_TOPIC, self._take_failure)
         self.run_everywhere(_nothing)  # told here, since a worker without our modules ends when it is given a task
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -135,10 +145,12 @@ class Dask:
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         # Not `allow_other_workers`: workers whose disk is full are idle, and would steal what is kept from them.
         workers = [each for each in self._addresses() if each not in self._full] or None if self._full else None
+        key = _key(function)
+        self._keys.add(key)
         with self._explained():
             future = self._client.submit(
                 _run_on_worker, function, self._settings, *arguments,
-                retries=self._retries, pure=False, key=_key(function), workers=workers,
+                retries=self._retries, pure=False, key=key, workers=workers,
             )  # fmt: skip
         if workers:
             self._kept_to[future.key] = workers
@@ -153,7 +165,7 @@ class Dask:
                 assert outcome.full is not None
                 address, key = outcome.full
                 self._full.add(address)
-                self.retried += 1
+                self._count(1)
                 if given is None or not self._has_room():
                     assert outcome.error is not None
                     raise outcome.error
@@ -166,6 +178,24 @@ class Dask:
         for each in given[1] if given is not None else ():  # what they were made from may go
             self._given.pop(getattr(each, "key", ""), None)
         return outcome
+
+    def _take_event(self, event: tuple[float, Any]) -> None:
+        """Count the tasks that Dask hands to other workers because theirs is gone."""
+        said = event[1]
+        if isinstance(said, dict) and said.get("action") == "remove-worker":
+            lost = {*said.get("processing-tasks", ()), *said.get("lost-computed-tasks", ())}
+            self._count(sum(key in self._keys for key in lost))
+
+    def _take_failure(self, event: tuple[float, Any]) -> None:
+        """Count a task that Dask tries again, which it does `retries` times."""
+        key = event[1]
+        if key in self._keys:
+            self._failed[key] += 1
+            self._count(int(self._failed[key] <= self._retries))
+
+    def _count(self, tries: int) -> None:
+        with self._counting:
+            self.retried += tries
 
     def _has_room(self) -> bool:
         """Whether some worker has room on its disk, those included that come soon in place of others that died."""
@@ -292,12 +322,13 @@ def _run_on_worker(function: Callable[..., Any], settings: Settings, *arguments:
     try:
         return run_task(function, settings, *arguments)
     except Exception as error:
-        if not is_full(error):
-            raise
         from distributed import get_worker
 
-        time.sleep(_FULL_SECONDS)
         worker: Any = get_worker()
+        if not is_full(error):
+            worker.log_event(_FAILED_TOPIC, worker.get_current_task())
+            raise
+        time.sleep(_FULL_SECONDS)
         return Outcome(error=error, full=(worker.address, worker.get_current_task()))
 
 

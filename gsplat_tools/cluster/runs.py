@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import secrets
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -44,6 +45,7 @@ class Stages:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
+        self.run_id = secrets.token_hex(8)
         self.outcomes: list[Outcome] = []
         self.spent: dict[str, dict[str, float]] = {}
 

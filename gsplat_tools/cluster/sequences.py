@@ -201,11 +201,8 @@ class _Job:
         for segment in self.segments:
             own = hashlib.sha256(f"{key} {segment}".encode()).hexdigest()
             path = f"{folder}/{segment[0]:06d}-{own[:16]}.part"
-            pending.append(
-                self.stages.engine.submit(
-                    tasks.encode_segment, self.source, fit, shared, segment, path, own, self.uses_deltas, self.checks
-                )
-            )
+            arguments = (self.source, fit, shared, segment, path, own, self.stages.run_id, self.uses_deltas, self.checks)
+            pending.append(self.stages.engine.submit(tasks.encode_segment, *arguments))
             sizes.append(segment[1])
         found: list[Part] = list(self.stages.run("encode", "encoding", pending, sizes))
         passes = 1 if self.checks is None else 2

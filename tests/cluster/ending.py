@@ -2,6 +2,7 @@
 
 import os
 import signal
+from pathlib import Path
 
 
 def end_or_return(index: int) -> int:
@@ -9,3 +10,12 @@ def end_or_return(index: int) -> int:
     if index == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return index * index
+
+
+def fail_at_first(folder: str, times: int) -> int:
+    """Fail so many times in a way that may pass; return how often it was tried."""
+    tries = len(list(Path(folder).glob("*.try")))
+    (Path(folder) / f"{tries}.try").touch()
+    if tries < times:
+        raise ConnectionError("busy")
+    return tries + 1

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -285,6 +287,27 @@ def test_a_run_that_ended_early__is_continued(scenes: Path, interrupted: tuple[P
     assert report.cluster["kept_blocks"] == 3
     assert sha256(target.read_bytes()) == expected
     assert not parts_of(target)
+
+
+def test_a_block_whose_worker_died_after_it__is_one_of_this_run(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsplat_tools.cluster.engines._FIRST_PAUSE", 0)
+    sealed, written = block_tasks.sealed, []
+
+    @contextmanager
+    def lost(path: str, said: dict[str, Any]) -> Iterator[Any]:
+        with sealed(path, said) as body:
+            yield body
+        written.append(path)
+        if len(written) == 2:
+            raise ConnectionError("lost")
+
+    monkeypatch.setattr(block_tasks, "sealed", lost)
+    report = in_blocks(scenes / "1.ply", tmp_path / "out.sog4d", **QUICK)
+
+    assert len(written) == report.cluster["blocks"] == 3  # the second was found
+    assert (report.cluster["kept_blocks"], report.cluster["retried"]) == (0, 1)
 
 
 @pytest.mark.parametrize("kind", ["rows", "scene", "0", "position_hi"])

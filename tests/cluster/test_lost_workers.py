@@ -27,7 +27,7 @@ from gsplat_tools.formats.saving import save
 from gsplat_tools.progress import Stage, report_to
 from tests.clouds import random_cloud
 from tests.cluster.crowded import keep_slowly
-from tests.cluster.ending import end_or_return
+from tests.cluster.ending import end_or_return, fail_at_first
 
 pytestmark = pytest.mark.cluster
 
@@ -163,6 +163,17 @@ def test_a_worker_that_comes_instead__goes_on(engine: Dask, start_worker: StartW
     start_worker(name=2)
 
     assert [outcome.result() for outcome in engine.results(pending)] == [9, 16]
+    assert engine.retried in (1, 2)  # the second may have waited at the worker that died, or at the scheduler
+
+
+def test_tries__are_counted(engine: Dask, tmp_path: Path) -> None:
+    for name, times in (("passes", 2), ("stays", 9)):
+        (tmp_path / name).mkdir()
+        _, found = next(engine.completed([engine.submit(fail_at_first, str(tmp_path / name), times)]))
+        assert isinstance(found, ConnectionError) == (name == "stays")
+
+    assert engine.retried == 2 + 3
+    assert len(list((tmp_path / "stays").iterdir())) == 1 + 3
 
 
 def test_workers_without_our_modules__are_refused(scheduler: str, start_worker: StartWorker, tmp_path: Path) -> None:
