@@ -27,17 +27,26 @@ def one_line(text: object) -> str:
     return quoted(" ".join(str(text).split()))
 
 
+class _EndedError(SystemExit):
+    """A signal ends the command."""
+
+
 def _end_cleanly_on_signals() -> None:
     """Let SIGTERM and SIGHUP unwind the stack, so that temporary files are removed."""
 
     def end(number: int, _frame: object) -> None:
         click.echo(f"ended by {signal.Signals(number).name}; the target is as it was", err=True)
-        sys.exit(128 + number)
+        raise _EndedError(128 + number)
 
+    _listen(end)
+
+
+def _listen(handler: Any) -> None:
+    """Set what happens on SIGTERM and SIGHUP."""
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGTERM", "SIGHUP"):
             if hasattr(signal, name):
-                signal.signal(getattr(signal, name), end)
+                signal.signal(getattr(signal, name), handler)
 
 
 @contextmanager
@@ -78,6 +87,9 @@ def reports_errors(command: Callable[Parameters, Result]) -> Callable[Parameters
         except OSError as error:
             place = f"{error.filename}: " if error.filename else ""
             click.echo(f"error: {place}{one_line(error.strerror or error)}", err=True)
+        except _EndedError:
+            _listen(signal.SIG_IGN)  # a second one would show as a traceback of what libraries do at the very end
+            raise
         except KeyboardInterrupt:
             click.echo("interrupted; the target is as it was", err=True)
             sys.exit(EXIT_INTERRUPTED)

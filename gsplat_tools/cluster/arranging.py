@@ -112,6 +112,8 @@ class Arrangement:
         `importance.top_weight` of the scene.
     facts
         What a `GaussianCloud` says besides its arrays.
+    kept
+        Whether the rows were there from an earlier run.
     """
 
     path: str
@@ -127,6 +129,12 @@ class Arrangement:
     sh0_range: tuple[float, float]
     top_weight: float
     facts: dict[str, str]
+    kept: bool = False
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row."""
+        return row_type(self.sh_degree).itemsize
 
     @property
     def ends(self) -> tuple[Float32, Float32]:
@@ -276,7 +284,7 @@ def _found(path: str, rows: str, key: str) -> Arrangement | None:
         return None
     drawn = {name: (start, count) for name, (start, count) in said["drawn"].items()}
     low, high = said["sh0_range"]
-    found = Arrangement(**said | {"drawn": drawn, "sh0_range": (low, high), "path": path, "rows": rows})
+    found = Arrangement(**said | {"drawn": drawn, "sh0_range": (low, high), "path": path, "rows": rows, "kept": True})
     return found if found.is_whole() else None
 
 

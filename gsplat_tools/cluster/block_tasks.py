@@ -68,6 +68,8 @@ class CodePart:
         Errors against the source, where they were checked.
     seconds
         What it took to make.
+    run
+        The run that made it.
     kept
         Whether it was there from an earlier run.
     """
@@ -79,7 +81,12 @@ class CodePart:
     clipped: dict[str, int] = field(default_factory=dict)
     tally: AttributeTally | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    run: str = ""
     kept: bool = False
+
+    def column_bytes(self, name: str) -> int:
+        """Return the bytes of the codes of one image."""
+        return self.count * self.columns[name][1]
 
     def column(self, name: str) -> NDArray[np.uint8]:
         """Return the codes of one image, (count, bytes a splat).
@@ -90,7 +97,7 @@ class CodePart:
             They went missing, or are not those that were written.
         """
         offset, width, expected = self.columns[name]
-        data = b"".join(part_bytes(self.path, offset, self.count * width))
+        data = b"".join(part_bytes(self.path, offset, self.column_bytes(name)))
         if checksum(data) != expected:
             raise ClusterError("a finished block was changed; the same command makes it anew", path=self.path)
         return np.frombuffer(data, np.uint8).reshape(self.count, width)
@@ -110,12 +117,14 @@ def fit_scene(arrangement: Arrangement, options: Sog4dOptions, layout: tuple[int
     return replace(shared, pilot=np.ascontiguousarray(arrangement.drawn_rows("pilot")["shN"]))
 
 
-def encode_block(arrangement: Arrangement, shared: Shared, index: int, path: str, key: str, is_checked: bool) -> CodePart:
-    """Encode a block to a part, unless an earlier run left it; if checked, hold it against its source first."""
+def encode_block(
+    arrangement: Arrangement, shared: Shared, index: int, path: str, key: str, run: str, is_checked: bool
+) -> CodePart:
+    """Encode a block to a part, unless an earlier run or try left it; if checked, hold it against its source first."""
     said = read_sealed(path, key)
     if said is not None:
         columns = {name: (start, width, found) for name, (start, width, found) in said["columns"].items()}
-        own = {"columns": columns, "tally": tally_from_json(said["tally"]), "path": path, "kept": True}
+        own = {"columns": columns, "tally": tally_from_json(said["tally"]), "path": path, "kept": said.get("run") != run}
         return CodePart(**said | own)
     start = time.perf_counter()
     cloud, is_long = arrangement.block(index)
@@ -132,6 +141,7 @@ def encode_block(arrangement: Arrangement, shared: Shared, index: int, path: str
         clipped=planes.clipped,
         tally=tally,
         seconds={"read": read - start, "encode": encoded - read, "validate": checked - encoded},
+        run=run,
     )
     offset = 0
     for name, column in planes.columns.items():
@@ -173,16 +183,23 @@ def _checked(cloud: GaussianCloud, columns: Columns, entries: Mapping[str, bytes
 
 
 def compress_plane(
-    name: str, blocks: Sequence[CodePart], layout: tuple[int, int], options: Sog4dOptions, path: str, key: str, is_checked: bool
+    name: str,
+    blocks: Sequence[CodePart],
+    layout: tuple[int, int],
+    options: Sog4dOptions,
+    path: str,
+    key: str,
+    run: str,
+    is_checked: bool,
 ) -> Part:
-    """Join the codes of all blocks to one image and compress it to a part, unless an earlier run left it.
+    """Join the codes of all blocks to one image and compress it to a part, unless an earlier run or try left it.
 
     Raises
     ------
     ValidationError
         The image does not decompress to the codes.
     """
-    found = read_part(path, key)
+    found = read_part(path, key, run)
     if found is not None:
         return found
     start = time.perf_counter()
@@ -209,6 +226,7 @@ def compress_plane(
             deltas={},
             facts=SegmentFacts(),
             seconds=seconds,
+            run=run,
         )
         write_part(part, body)
     return part

@@ -90,7 +90,7 @@ def convert_blocks(
     Returns
     -------
     ClusterReport
-        As of `convert`, and the seconds of every stage.
+        As of `convert`, and the seconds and bytes of every stage.
 
     Raises
     ------
@@ -231,6 +231,8 @@ class _Job:
         submit, count = self.stages.engine.submit, self.source.first.splats
         looking = submit(look_at_scene, self.source, self.choices)
         look: Look = self._only("look", "reading", looking, count)
+        source_bytes = int(before.split()[0])
+        self.stages.note("look", bytes_read=(1 if look.scan.view is None else 2) * source_bytes)
         if look.scan.num_kept < tasks.FORMAT.min_splats:
             raise CapabilityError(
                 f"{tasks.FORMAT.title} holds at least {tasks.FORMAT.min_splats} splat, and none is left to write"
@@ -241,6 +243,9 @@ class _Job:
         key = self._own("scene")
         arranging = submit(arrange, self.source, looking, self.choices, self.options, self.folder, key, self.block_splats)
         arrangement: Arrangement = self._only("arrange", "arranging", arranging, look.scan.num_kept)
+        if not arrangement.kept:
+            rows = arrangement.num_splats + sum(count for _, count in arrangement.drawn.values())
+            self.stages.note("arrange", bytes_read=2 * source_bytes, bytes_written=rows * arrangement.row_bytes)
         if identity(name) != before:
             raise ReadError("the source changed while it was read; convert again", path=name)
         return look, arrangement
@@ -250,16 +255,19 @@ class _Job:
         submit = self.stages.engine.submit
         self._shared = submit(block_tasks.fit_scene, arrangement, self.options, self.layout)
         shared: Shared = self._only("fit", "fitting codebooks", self._shared, 0)
+        drawn = arrangement.drawn["sample"][1] + arrangement.drawn["pilot"][1]
+        self.stages.note("fit", bytes_read=drawn * arrangement.row_bytes)
         pending, sizes = [], []
         for index in range(len(arrangement.digests)):
             own = self._own(f"block {index}")
             path = f"{self.folder}/{index:06d}-{own[:16]}.part"
-            pending.append(
-                submit(block_tasks.encode_block, arrangement, self._shared, index, path, own, self.checks is not None)
-            )
+            arguments = (arrangement, self._shared, index, path, own, self.stages.run_id, self.checks is not None)
+            pending.append(submit(block_tasks.encode_block, *arguments))
             sizes.append(arrangement.size_of(index))
         found: list[CodePart] = list(self.stages.run("encode", "encoding", pending, sizes, "splats"))
-        self._note("encode", found)
+        for block in found:
+            written = sum(map(block.column_bytes, block.columns))
+            self._note("encode", block, bytes_read=block.count * arrangement.row_bytes, bytes_written=written)
         return found, shared
 
     def compress(self, arrangement: Arrangement, blocks: list[CodePart]) -> list[Part]:
@@ -268,12 +276,14 @@ class _Job:
         for name in names:
             own = self._own(f"image {name}")
             path = f"{self.folder}/{name}-{own[:16]}.part"
-            arguments = (name, blocks, self.layout, self.options, path, own, self.checks is not None)
+            arguments = (name, blocks, self.layout, self.options, path, own, self.stages.run_id, self.checks is not None)
             pending.append(self.stages.engine.submit(block_tasks.compress_plane, *arguments))
         found: list[Part] = list(
             self.stages.run("compress", "compressing", pending, [arrangement.num_splats] * len(names), "pixels")
         )
-        self._note("compress", found)
+        for name, image in zip(names, found, strict=True):
+            read = sum(block.column_bytes(name) for block in blocks)
+            self._note("compress", image, bytes_read=read, bytes_written=image.stored_size)
         return found
 
     def judge(
@@ -284,6 +294,8 @@ class _Job:
         if self.checks is not None and self.checks.views > 0:
             drawing = self.stages.engine.submit(block_tasks.draw_scene, arrangement, self._shared, blocks, self.checks)
             views, count = self._only("draw", "rendering", drawing, 0)
+            read = sum(block.column_bytes(each) for block in blocks for each in block.columns)
+            self.stages.note("draw", bytes_read=count * arrangement.row_bytes + read)
             rendered = {"rendered_splats": count}
         result = judge(views, [block.tally for block in blocks], validation, model)
         return None if result is None else {**result, **rendered}
@@ -297,8 +309,7 @@ class _Job:
         """Return the key of a part."""
         return hashlib.sha256(f"{self._key} {what}".encode()).hexdigest()
 
-    def _note(self, name: str, found: list[CodePart] | list[Part]) -> None:
-        """Add up what tasks say about themselves."""
-        for part in found:
-            if not part.kept:
-                self.stages.note(name, **{f"{what}_seconds": spent for what, spent in part.seconds.items()})
+    def _note(self, name: str, part: CodePart | Part, **moved: int) -> None:
+        """Add up what a task says about itself, and the bytes that it moved, unless an earlier run did it."""
+        if not part.kept:
+            self.stages.note(name, **moved, **{f"{what}_seconds": spent for what, spent in part.seconds.items()})

@@ -121,6 +121,8 @@ class Part:
         Errors against the source and pictures of its frames, where it was checked.
     seconds
         What it took to make.
+    run
+        The run that made it.
     kept
         Whether it was there from an earlier run.
     """
@@ -134,7 +136,13 @@ class Part:
     tally: AttributeTally | None = None
     views: list[ViewReport] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    run: str = ""
     kept: bool = False
+
+    @property
+    def stored_size(self) -> int:
+        """Bytes of all entries."""
+        return max(entry.offset + entry.stored_size for entry in self.entries)
 
     def to_json(self) -> dict[str, Any]:
         """Return what the file says about itself."""
@@ -150,6 +158,7 @@ class Part:
             "tally": tally_to_json(self.tally),
             "views": [asdict(view) for view in self.views],
             "seconds": self.seconds,
+            "run": self.run,
         }
 
 
@@ -167,8 +176,8 @@ def tally_from_json(said: dict[str, Any] | None) -> AttributeTally | None:
     return tally
 
 
-def part_from_json(path: str, said: dict[str, Any]) -> Part:
-    """Return what `Part.to_json` gave."""
+def part_from_json(path: str, said: dict[str, Any], run: str) -> Part:
+    """Return what `Part.to_json` gave; of the same run it is not kept: its worker died after it was made."""
     facts = SegmentFacts(
         ranges=[(np.array(low, np.float32), np.array(high, np.float32)) for low, high in said["ranges"]],
         sources=set(said["sources"]),
@@ -184,7 +193,8 @@ def part_from_json(path: str, said: dict[str, Any]) -> Part:
         tally=tally_from_json(said["tally"]),
         views=[ViewReport(**view) for view in said["views"]],
         seconds=said["seconds"],
-        kept=True,
+        run=said.get("run", ""),
+        kept=said.get("run") != run,
     )
 
 
@@ -196,11 +206,11 @@ def write_part(part: Part, body: BinaryIO) -> None:
             stream.write(block)
 
 
-def read_part(path: str, key: str) -> Part | None:
-    """Return the part that an earlier run left, after reading all its bytes; None where there is none that can be used."""
+def read_part(path: str, key: str, run: str) -> Part | None:
+    """Return the part that an earlier run or try left, after reading all its bytes; None where none can be used."""
     said = read_sealed(path, key)
     try:
-        return None if said is None else part_from_json(path, said)
+        return None if said is None else part_from_json(path, said, run)
     except (ValueError, KeyError, TypeError):
         return None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import secrets
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,8 @@ from gsplat_tools.comparison.attributes import AttributeTally
 from gsplat_tools.comparison.rendered import ViewReport, summarize_views
 from gsplat_tools.convert import ConversionReport
 from gsplat_tools.errors import CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError
-from gsplat_tools.formats._stores import exists, local_path
+from gsplat_tools.formats._atomic import check_target
+from gsplat_tools.formats._stores import exists, is_url, local_path
 from gsplat_tools.formats.saving import find_target
 from gsplat_tools.progress import stage
 from gsplat_tools.verification import Validation
@@ -43,6 +45,7 @@ class Stages:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
+        self.run_id = secrets.token_hex(8)
         self.outcomes: list[Outcome] = []
         self.spent: dict[str, dict[str, float]] = {}
 
@@ -81,12 +84,16 @@ def bundle_target(target: str | Path, to: str | None, what: str, *, overwrite: b
         The target is of another format.
     TargetExistsError
         It is there and `overwrite` is false.
+    WriteError
+        It could not be written: its folder is missing, or it is no file.
     """
     target = Path(local_path(target))
     record = find_target(target, to)
     if record.id != "sog4d":
         raise CapabilityError(f"{what}, not {record.title}", path=target)
-    if exists(target) and not overwrite:
+    if not is_url(target):
+        check_target(target, overwrite=overwrite)
+    elif exists(target) and not overwrite:
         raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=target)
     return target
 

@@ -172,16 +172,17 @@ class _Job:
     def fit(self) -> tuple[Kept, Any, Any]:
         """Return which splats stay, and the tasks that fit frames and codebooks."""
         self.identities = self._over_frames("identify", "looking for frames", tasks.identify_frames)
-        source_bytes = sum(int(each.split()[0]) for each in self.identities)
-        for name, passes in (("look", 1), ("fit", 1), ("encode", 1 if self.checks is None else 2)):
-            self.stages.note(name, bytes_read=passes * source_bytes)
+        self.frame_bytes = [int(each.split()[0]) for each in self.identities]
+        self.stages.note("look", bytes_read=sum(self.frame_bytes))
         facts = self._over_frames("look", "checking frames", tasks.look_at_frames, self.choices)
         kept = kept_splats(facts, self.source.first.splats, self.choices)
         if not kept.keeps.any():
             raise CapabilityError("a .sog4d bundle needs at least one splat, and none is left to write")
         if not kept.keeps.all():
+            self.stages.note("look", bytes_read=sum(self.frame_bytes))
             kept = with_scan(kept, self._over_frames("look", "checking frames", tasks.look_at_frames, self.choices, kept.keeps))
         layout = choose_layout(int(np.count_nonzero(kept.keeps)), self.options)
+        self.stages.note("fit", bytes_read=sum(self.frame_bytes))
         submit = self.stages.engine.submit
         fit = submit(tasks.decide, self.source, kept, self.choices)
         # The samples stay where they are drawn until the codebooks are fitted.
@@ -200,17 +201,19 @@ class _Job:
         for segment in self.segments:
             own = hashlib.sha256(f"{key} {segment}".encode()).hexdigest()
             path = f"{folder}/{segment[0]:06d}-{own[:16]}.part"
-            pending.append(
-                self.stages.engine.submit(
-                    tasks.encode_segment, self.source, fit, shared, segment, path, own, self.uses_deltas, self.checks
-                )
-            )
+            arguments = (self.source, fit, shared, segment, path, own, self.stages.run_id, self.uses_deltas, self.checks)
+            pending.append(self.stages.engine.submit(tasks.encode_segment, *arguments))
             sizes.append(segment[1])
         found: list[Part] = list(self.stages.run("encode", "encoding", pending, sizes))
-        for part in found:
-            seconds = {} if part.kept else {f"{name}_seconds": spent for name, spent in part.seconds.items()}
-            end = max(entry.offset + entry.stored_size for entry in part.entries)
-            self.stages.note("encode", bytes_written=end, **seconds)
+        passes = 1 if self.checks is None else 2
+        for part, (start, count) in zip(found, self.segments, strict=True):
+            if not part.kept:
+                self.stages.note(
+                    "encode",
+                    bytes_read=passes * sum(self.frame_bytes[start : start + count]),
+                    bytes_written=part.stored_size,
+                    **{f"{name}_seconds": spent for name, spent in part.seconds.items()},
+                )
         return found
 
     def _over_frames(self, name: str, label: str, function: Callable[..., Any], *arguments: Any) -> list[Any]:

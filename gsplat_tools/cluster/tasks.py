@@ -123,11 +123,12 @@ def encode_segment(
     segment: tuple[int, int],
     path: str,
     key: str,
+    run: str,
     uses_deltas: bool,
     checks: Checks | None,
 ) -> Part:
-    """Encode a segment to a part, unless an earlier run left it; with `checks`, hold it against its source first."""
-    found = read_part(path, key)
+    """Encode a segment to a part, unless an earlier run or try left it; with `checks`, hold it against its source first."""
+    found = read_part(path, key, run)
     if found is not None:
         return found
     start, options = time.perf_counter(), shared.options
@@ -159,6 +160,7 @@ def encode_segment(
             tally=alone.tally,
             views=alone.views,
             seconds={"read": reading, "encode": encoded - start - reading, "validate": checked - encoded},
+            run=run,
         )
         write_part(part, body)
     part.seconds["write"] = time.perf_counter() - checked

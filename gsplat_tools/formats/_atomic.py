@@ -52,7 +52,7 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
         not read back as it was written.
     """
     with _explained(path):
-        target = _find_target(path, overwrite=overwrite)
+        target = check_target(path, overwrite=overwrite)
         sweep_stale(target)
     with temporary_beside(target) as stream:
         temporary = Path(stream.name)
@@ -212,8 +212,16 @@ def _explained(path: Path) -> Iterator[None]:
         raise WriteError(f"cannot write: {reason(error)}", path=path) from error
 
 
-def _find_target(path: Path, *, overwrite: bool) -> Path:
-    """Return the file to replace: a link stays a link, and what it points to is replaced."""
+def check_target(path: Path, *, overwrite: bool) -> Path:
+    """Return the file to replace, if it may be written: a link stays a link, and what it points to is replaced.
+
+    Raises
+    ------
+    TargetExistsError
+        The target is there and `overwrite` is false, or it is a folder.
+    WriteError
+        Its folder is missing, or it is nothing that may be replaced.
+    """
     target = Path(os.path.realpath(path))
     if target.is_symlink():
         raise WriteError("the target is a link that leads to itself; remove it", path=path)

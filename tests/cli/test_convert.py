@@ -272,6 +272,25 @@ def test_convert__that_is_ended_removes_its_temporary_file(tmp_path: Path) -> No
     assert not any((tmp_path / "out").iterdir())
 
 
+def test_a_second_signal__does_not_disturb_what_is_done_at_the_very_end() -> None:
+    text = """
+import atexit, os, signal
+from gsplat_tools.cli._errors import reports_errors
+
+@atexit.register
+def end():
+    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.SIGHUP)
+    print("cleaned")
+
+reports_errors(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+"""
+    ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
+
+    assert (ended.returncode, ended.stdout) == (128 + signal.SIGTERM, "cleaned\n")
+    assert ended.stderr == "ended by SIGTERM; the target is as it was\n"
+
+
 def test_dry_run__estimates_and_writes_nothing(tmp_path: Path) -> None:
     source = tmp_path / "scene.ply"
     save(random_cloud(200, sh_degree=1), source)

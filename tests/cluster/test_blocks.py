@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +155,35 @@ def test_checks__are_those_of_one_machine(scenes: Path, tmp_path: Path) -> None:
             assert others[name][kind] == (None if value is None else pytest.approx(value, rel=1e-9)), (name, kind)
 
 
+def test_stages__tell_the_bytes_that_they_moved(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: dict[str, int] = {}
+    monkeypatch.setattr(blocks, "remove_parts", lambda folder: sizes.update(
+        {path.name: path.stat().st_size for path in Path(folder).iterdir()}
+    ))  # fmt: skip
+    source, options = scenes / "1.ply", {**QUICK, "validation": Validation(), "prune_faint": 0.01}
+    report = in_blocks(source, tmp_path / "out.sog4d", **options)
+    stages, read = report.cluster["stages"], source.stat().st_size
+    rows = next(size for name, size in sizes.items() if name.startswith("rows"))
+    written = {
+        "arrange": sum(size for name, size in sizes.items() if name.startswith(("rows", "scene"))),
+        "encode": sum(size for name, size in sizes.items() if name[:6].isdecimal()),
+        "compress": sum(size for name, size in sizes.items() if not name.startswith(("rows", "scene", "0"))),
+    }
+
+    assert stages["look"]["bytes_read"] == stages["arrange"]["bytes_read"] == 2 * read
+    assert stages["encode"]["bytes_read"] == rows
+    assert stages["compress"]["bytes_read"] == stages["encode"]["bytes_written"]
+    assert stages["fit"]["bytes_read"] == stages["arrange"]["bytes_written"] - 2 * rows  # without those for pictures
+    assert stages["draw"]["bytes_read"] == rows + stages["encode"]["bytes_written"]  # all splats are drawn
+    assert stages["assemble"]["bytes"] == report.bytes
+    for name, size in written.items():
+        assert 0 < size - stages[name]["bytes_written"] < 30_000, name  # what parts say about themselves
+
+    again = in_blocks(source, tmp_path / "out.sog4d", overwrite=True, **options).cluster["stages"]
+    for name in written:
+        assert "bytes_written" not in again[name], name
+
+
 def test_pictures_of_large_scenes__show_every_so_manieth_splat(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,6 +289,27 @@ def test_a_run_that_ended_early__is_continued(scenes: Path, interrupted: tuple[P
     assert not parts_of(target)
 
 
+def test_a_block_whose_worker_died_after_it__is_one_of_this_run(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsplat_tools.cluster.engines._FIRST_PAUSE", 0)
+    sealed, written = block_tasks.sealed, []
+
+    @contextmanager
+    def lost(path: str, said: dict[str, Any]) -> Iterator[Any]:
+        with sealed(path, said) as body:
+            yield body
+        written.append(path)
+        if len(written) == 2:
+            raise ConnectionError("lost")
+
+    monkeypatch.setattr(block_tasks, "sealed", lost)
+    report = in_blocks(scenes / "1.ply", tmp_path / "out.sog4d", **QUICK)
+
+    assert len(written) == report.cluster["blocks"] == 3  # the second was found
+    assert (report.cluster["kept_blocks"], report.cluster["retried"]) == (0, 1)
+
+
 @pytest.mark.parametrize("kind", ["rows", "scene", "0", "position_hi"])
 @pytest.mark.parametrize("damage", ["changed", "cut", "gone"])
 def test_a_damaged_part__is_made_again(scenes: Path, interrupted: tuple[Path, str], kind: str, damage: str) -> None:
@@ -347,6 +399,9 @@ def test_sources_that_are_read_whole_and_other_targets__are_refused(scenes: Path
         in_blocks(tmp_path / "pipe", tmp_path / "out.sog4d")
     with pytest.raises(CapabilityError, match=r"becomes a \.sog4d bundle"):
         in_blocks(scenes / "0.ply", tmp_path / "out.spz")
+    with pytest.raises(WriteError, match="make it first"):
+        in_blocks(scenes / "0.ply", tmp_path / "missing/out.sog4d")
+    assert not (tmp_path / "missing").exists()
     with pytest.raises(CapabilityError, match="at least one splat"):
         in_blocks(scenes / "0.ply", tmp_path / "out.sog4d", block_splats=0)
 

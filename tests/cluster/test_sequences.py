@@ -54,6 +54,23 @@ def test_seconds__add_up_to_what_a_run_took(tmp_path: Path) -> None:
     assert 0.2 < sum(report.seconds.values()) / (time.perf_counter() - start) <= 1
 
 
+def test_stages__tell_the_bytes_that_they_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pattern = make_frames(tmp_path / "frames", 7, 60)
+    monkeypatch.setattr("gsplat_tools.cluster.sequences.remove_parts", lambda folder: None)
+    first = convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), **SHORT)  # type: ignore[arg-type]
+    source = sum(path.stat().st_size for path in (tmp_path / "frames").iterdir())
+    parts = parts_of(tmp_path / "out.sog4d")
+    parts[1].unlink()
+    again = convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), overwrite=True, **SHORT)  # type: ignore[arg-type]
+
+    one, two = first.cluster["stages"], again.cluster["stages"]
+    assert one["look"]["bytes_read"] == one["fit"]["bytes_read"] == source
+    assert one["encode"]["bytes_read"] == 2 * source
+    assert two["encode"]["bytes_read"] == pytest.approx(2 * source * 3 / 7)  # the second segment alone
+    assert 0 < two["encode"]["bytes_written"] < one["encode"]["bytes_written"]
+    assert one["assemble"]["bytes"] == first.bytes
+
+
 def test_frames_with_invalid_splats__are_dropped_alike(tmp_path: Path) -> None:
     for index, cloud in enumerate(moving(100, 5, sh_degree=1)):
         means = cloud.means.copy()
@@ -113,8 +130,10 @@ def test_a_dask_worker_that_dies__changes_no_byte(tmp_path: Path) -> None:
     engine = open_engine("local-cluster:1")
     try:
         with killing(engine, lambda: bool(parts_of(target))) as killed:
-            convert_sequence([pattern], target, engine, validation=None, **SHORT)
+            report = convert_sequence([pattern], target, engine, validation=None, **SHORT)
         assert len(killed) == 1
+        assert report.cluster["retried"] >= 1
+        assert report.cluster["kept_segments"] == 0
         assert pids(engine) != killed
     finally:
         engine.close()
@@ -153,6 +172,24 @@ def test_a_run_that_ended_early__is_continued(tmp_path: Path, monkeypatch: pytes
     assert not parts_of(target)
 
 
+def test_a_part_whose_worker_died_after_it__is_one_of_this_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pattern = make_frames(tmp_path / "frames", 7, 60)
+    monkeypatch.setattr("gsplat_tools.cluster.engines._FIRST_PAUSE", 0)
+    write_part, written = tasks.write_part, []
+
+    def lost(part: Any, body: Any) -> None:
+        write_part(part, body)
+        written.append(part.path)
+        if len(written) == 2:
+            raise ConnectionError("lost")
+
+    monkeypatch.setattr(tasks, "write_part", lost)
+    report = convert_sequence([pattern], tmp_path / "out.sog4d", InProcess(), validation=None, **SHORT)
+
+    assert len(written) == report.cluster["segments"] == 3  # the second was found
+    assert (report.cluster["kept_segments"], report.cluster["retried"]) == (0, 1)
+
+
 def test_a_part_that_is_cut_off_anywhere__is_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pattern = make_frames(tmp_path / "frames", 2, 20)
     kept: dict[str, bytes] = {}
@@ -163,12 +200,12 @@ def test_a_part_that_is_cut_off_anywhere__is_no_part(tmp_path: Path, monkeypatch
     ((_, data),) = kept.items()
     (path,) = parts_of(tmp_path / "out.sog4d")
     key = path.name.split("-")[1].split(".")[0]
-    stored = read_part(str(path), "?")
+    stored = read_part(str(path), "?", "")
 
     assert stored is None  # another key
     for size in [*range(0, len(data), max(1, len(data) // 40)), len(data) - 1]:
         path.write_bytes(data[:size])
-        assert read_part(str(path), key) is None, size
+        assert read_part(str(path), key, "") is None, size
 
 
 def test_a_source_that_changed__is_encoded_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,6 +225,9 @@ def test_what_cannot_be_done__is_refused_before_work(tmp_path: Path) -> None:
     (tmp_path / "there.sog4d").write_bytes(b"")
     with pytest.raises(TargetExistsError):
         convert_sequence([pattern], tmp_path / "there.sog4d", InProcess())
+    with pytest.raises(WriteError, match="make it first"):
+        convert_sequence([pattern], tmp_path / "missing/out.sog4d", InProcess())
+    assert not (tmp_path / "missing").exists()
     with pytest.raises(CapabilityError, match="a cluster makes"):
         convert_sequence([pattern], tmp_path / "out.spz", InProcess())
     with pytest.raises(CapabilityError, match="unknown scheduler"):
