@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from typing import BinaryIO, Literal
 
 from gsplat_tools.errors import CorruptDataError, LimitExceededError, ReadError
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import Issue, Rule, raise_errors, refuse
 from gsplat_tools.formats._limits import MAX_EXPANSION, max_memory
+from gsplat_tools.formats._stream import stream_size
 
 Compression = Literal["stored", "deflated"]
 
@@ -60,6 +62,11 @@ class ZipReader:
     repeatable
         Names that may occur again; the last entry counts.
 
+    Attributes
+    ----------
+    length
+        Bytes of the archive.
+
     Raises
     ------
     CorruptDataError, LimitExceededError
@@ -67,6 +74,7 @@ class ZipReader:
     """
 
     def __init__(self, stream: BinaryIO, *, refuses: bool = True, repeatable: Collection[str] = ()) -> None:
+        self.length = stream_size(stream)
         stream.seek(0)
         try:
             self._archive = zipfile.ZipFile(stream)
@@ -97,6 +105,23 @@ class ZipReader:
     def method(self, name: str) -> str:
         """Return how an entry is compressed."""
         return "stored" if self._last[name].compress_type == zipfile.ZIP_STORED else "deflated"
+
+    def description(self, name: str) -> bytes:
+        """Return the bytes of a JSON entry, for `_json.parse` with the `length` of the archive.
+
+        Raises
+        ------
+        CorruptDataError, LimitExceededError
+            As `read`; it claims more than what may describe an archive of this length.
+        """
+        longest = _json.longest(self.length)
+        if name in self and self.size(name) > longest:
+            message = (
+                f"expected at most {longest} bytes that describe the others, the entry claims {self.size(name)}; "
+                "if you trust the file, allow them with --max-memory (library: use_max_memory)"
+            )
+            raise refuse(Issue(code="zip-entry-size", message=message, field=name), RULES)
+        return self.read(name)
 
     def read(self, name: str, *, frame: int | None = None, at_most: int | None = None) -> bytes:
         """Return the bytes of the last entry of that name.

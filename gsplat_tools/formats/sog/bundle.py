@@ -215,11 +215,11 @@ def open_bundle(stream: BinaryIO) -> tuple[Bundle | None, Folder | None]:
         if prefix + META_NAME not in archive:
             message = f"expected a meta.json at the root of the archive, found {len(archive.names)} other entries"
             raise fault("meta-missing", message, META_NAME)
-        bundle = Bundle(archive, parse_meta(archive.read(prefix + META_NAME, at_most=_json.MAX_BYTES)), prefix)
+        bundle = Bundle(archive, parse_meta(archive.description(prefix + META_NAME), available=archive.length), prefix)
         check_count(bundle.meta, stream_size(stream))
         return bundle, None
     folder = folder_of(stream)
-    data = stream.read(_json.MAX_BYTES + 1)
+    data = stream.read(_json.longest(0) + 1)
     stream.seek(0)
     if is_lod(data):
         return None, folder
