@@ -37,7 +37,7 @@ def check_range(shN: Float32, frame: int | None = None) -> None:
     count = int((np.abs(shN) > MAX_SH).any(axis=(1, 2)).sum())
     raise CapabilityError(
         f"{count} of {len(shN)} splats have SH coefficients beyond {MAX_SH:.3g} (up to {float(np.abs(shN).max()):.3g}), too "
-        "large for a palette; leave the bands out with --sh-degree 0, or write a format without palettes (.ply, .gspk)",
+        "large for a palette; leave the bands out with --sh-degree 0, or write a format without palettes (.ply)",
         field="shN",
         frame=frame,
     )
