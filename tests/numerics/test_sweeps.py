@@ -144,6 +144,28 @@ def test_plots__are_one_file_without_links() -> None:
     assert svg.startswith("<svg xmlns=")
 
 
+@pytest.mark.parametrize(
+    ("errors", "shown"),
+    [
+        ([1e-45, 1e-30, 1e-4, 2e-3, 2e-3, 2e-3], [1e-4, 2e-3]),  # opacities of huge logits
+        ([1e-3, 2e-3, 1e-2, 1e78], [1e-3, 1e-2]),  # covariances of splats that grew from nothing
+    ],
+)
+def test_plots__show_the_decades_that_hold_most_values(errors: list[float], shown: list[float]) -> None:
+    rows = [
+        Row(format="x", attribute="a", condition="c", sweep="s", x=float(i + 1), measured_max=error, bound=error, within=True)
+        for i, error in enumerate(errors)
+    ]
+
+    places = [float(y) for y in re.findall(r'<circle cx="[^"]*" cy="([^"]*)"', plot_svg(rows))]
+
+    inside = [place for place, error in zip(places, errors, strict=True) if shown[0] <= error <= shown[1]]
+    assert max(inside) - min(inside) > 40
+    for place, error in zip(places, errors, strict=True):  # y grows downwards
+        assert place > max(inside) or error >= shown[0]
+        assert place < min(inside) or error <= shown[1]
+
+
 def test_command__prints_json_and_writes_a_plot(tmp_path: Path) -> None:
     scene, plot = tmp_path / "scene.ply", tmp_path / "plot.html"
     save(random_cloud(60, sh_degree=0), scene)
