@@ -98,6 +98,15 @@ def test_positions__with_an_origin_are_measured_in_the_world() -> None:
     assert kept.measured_max == 0
 
 
+def test_half_rows__are_those_of_their_format(tmp_path: Path) -> None:
+    save(random_cloud(20, sh_degree=0), tmp_path / "scene.ply")
+
+    for names, expected in (["spz"], set()), (["spz", "visionary-f16"], {"visionary-f16"}):
+        rows = [*synthetic_rows(names, ["needle"]), *scene_rows(tmp_path / "scene.ply", names)]
+        assert {row.format for row in rows if row.attribute.startswith("vanished")} == expected
+        assert {row.format for row in rows} == set(names)
+
+
 def test_half_row__counts_needles_that_lose_their_minor_axis() -> None:
     thick = half_row(ordinary(log_scales=np.full((96, 3), -3.0)), "needle", "1")
     thin = half_row(ordinary(log_scales=np.tile([0.0, -9.0, -9.0], (96, 1))), "needle", "8e3")
