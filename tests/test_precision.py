@@ -28,7 +28,7 @@ from tests.clouds import random_cloud
 from tests.reference.splats import camera, splats
 
 
-def round_trip(cloud: GaussianCloud, format_id: str) -> tuple[GaussianCloud, dict[str, Any]]:
+def round_trip(cloud: GaussianCloud, format_id: str, **options: Any) -> tuple[GaussianCloud, dict[str, Any]]:
     """What comes back from a file, and the bounds that the format states."""
     record = FORMATS[format_id]
     assert record.write is not None
@@ -37,7 +37,7 @@ def round_trip(cloud: GaussianCloud, format_id: str) -> tuple[GaussianCloud, dic
     stream = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        record.write(cloud, stream, record.write_options())
+        record.write(cloud, stream, record.write_options(**options))
         stream.seek(0)
         scene = record.read(stream, record.read_options())
     decoded = scene.frame(0) if isinstance(scene, GaussianSequence) else scene
@@ -136,6 +136,21 @@ def test_visionary_rotations__do_not_depend_on_the_length_of_quaternions(length:
 
     assert np.array_equal(codes, expected)
     assert np.array_equal(logs, sorted_logs)
+
+
+@pytest.mark.parametrize("format_id", ["spz", "compressed-ply", "sog", "sog4d", "spark"])
+@pytest.mark.parametrize("largest", [1e-41, 3e38])
+@pytest.mark.parametrize("rotation", ["best", "small"])
+def test_rotations__stay_within_bounds_at_the_ends_of_float32(format_id: str, largest: float, rotation: str) -> None:
+    # Turning a quaternion into another frame added components, which left float32, or rounded them to its smallest steps.
+    cloud = random_cloud(300, sh_degree=0)
+    rows = np.random.default_rng(1).normal(size=(300, 4))
+    quats = (largest * rows / np.abs(rows).max(axis=1, keepdims=True)).astype(np.float32)
+    cloud = cloud.replace(quats=quats, log_scales=np.tile(np.float32([-1, -2, -3]), (300, 1)))
+
+    decoded, limits = round_trip(cloud, format_id, rotation=rotation)
+
+    assert (attribute_errors(cloud, decoded)["covariances"] <= limits["covariances"]).all()
 
 
 # -- far from zero

@@ -246,7 +246,7 @@ def run_manifest(
         told.append(report["status"])
         if quiet and report["status"] != "failed":
             return
-        text = f"{report['source']} -> {report['target']}"
+        text = f"{one_line(report['source'])} -> {one_line(report['target'])}"
         if report["status"] == "failed":
             click.echo(f"failed: {text}: {one_line(report['error']['message'])}", err=True)
         elif not as_json:

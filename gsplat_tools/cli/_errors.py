@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+import os
 import signal
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, ParamSpec, TypeVar
 
 import click
@@ -68,6 +69,31 @@ def _showing_warnings() -> Iterator[None]:
         yield
 
 
+def _comes_from_printing(error: OSError) -> bool:
+    """Whether click met the error; it opens no files for us."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("click.")
+
+
+@contextmanager
+def names_stdout() -> Iterator[None]:
+    """End with one line and exit status 1 where stdout cannot be written, in help texts as well."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) or not _comes_from_printing(error):
+            raise
+        click.echo(f"error: standard output: cannot write: {one_line(error.strerror or error)}", err=True)
+        # What is left in its buffer would fail again, in words of Python, when the process ends.
+        with suppress(OSError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
+        sys.exit(EXIT_DATA)
+
+
 def reports_errors(command: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Turn errors about data into one line on stderr and exit status 1."""
 
@@ -85,7 +111,9 @@ def reports_errors(command: Callable[Parameters, Result]) -> Callable[Parameters
         except BrokenPipeError:
             sys.stderr.close()
         except OSError as error:
-            place = f"{error.filename}: " if error.filename else ""
+            if _comes_from_printing(error):
+                raise  # see `names_stdout`
+            place = f"{one_line(error.filename)}: " if error.filename else ""
             click.echo(f"error: {place}{one_line(error.strerror or error)}", err=True)
         except _EndedError:
             _listen(signal.SIG_IGN)  # a second one would show as a traceback of what libraries do at the very end

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
+
+from gsplat_tools.cli._errors import names_stdout
 
 SECTIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Target", ("formats", "preset", "overwrite", "dry_run")),
@@ -23,6 +27,11 @@ SECTIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
 
 class SectionedCommand(click.Command):
     """A command whose help puts options under headings."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run, with a line where stdout fails."""
+        with names_stdout():
+            return super().main(*args, **kwargs)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, section by section."""

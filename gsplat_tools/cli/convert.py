@@ -370,7 +370,7 @@ def _estimated(report: dict[str, Any]) -> str:
         if report["frames"] > 1:
             basis += f" in {report['sampled_frames']} of {report['frames']} frames"
     return (
-        f"{report['source']} -> {report['target']['path']} ({report['target']['format']}), not written: "
+        f"{one_line(report['source'])} -> {one_line(report['target']['path'])} ({report['target']['format']}), not written: "
         f"{'' if report['exact'] else 'about '}{output.count(report['bytes'])} bytes, "
         f"{report['encode_seconds']:.2f} s to encode, {level}; {basis}"
     )
@@ -381,7 +381,7 @@ def _summary(report: dict[str, Any]) -> str:
     target, seconds = report["target"], report["seconds"]
     splats = report["splats"]
     lines = [
-        f"{report['source']} -> {target['path']} ({target['format']})",
+        f"{one_line(report['source'])} -> {one_line(target['path'])} ({target['format']})",
         f"  {output.count(splats)} splats, SH degree {report['sh_degree']}"
         + (f", {report['frames']} frames" if report["frames"] > 1 else "")
         + f", {output.count(target['bytes'])} bytes"

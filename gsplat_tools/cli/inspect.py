@@ -10,7 +10,7 @@ import click
 
 from gsplat_tools.cli import _options as options
 from gsplat_tools.cli import _output as output
-from gsplat_tools.cli._errors import EXIT_DATA, one_line, reports_errors
+from gsplat_tools.cli._errors import EXIT_DATA, names_stdout, one_line, reports_errors
 from gsplat_tools.cli._numerics import numerics
 from gsplat_tools.cli._tradeoff import tradeoff
 from gsplat_tools.cli._view import view
@@ -20,6 +20,11 @@ CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
 class InfoByDefault(click.Group):
     """A group whose command may be left out when only a file is given."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run, with a line where stdout fails."""
+        with names_stdout():
+            return super().main(*args, **kwargs)
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
         """Take `gsplat-inspect FILE` as `gsplat-inspect info FILE`."""

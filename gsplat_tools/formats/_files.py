@@ -14,7 +14,7 @@ from typing import IO, BinaryIO, cast
 
 import numpy as np
 
-from gsplat_tools.errors import ReadError, WriteError
+from gsplat_tools.errors import LimitExceededError, ReadError, WriteError
 from gsplat_tools.formats._stores import is_url, open_object
 from gsplat_tools.parallel import map_ordered
 
@@ -288,17 +288,31 @@ class Spool:
             )
 
 
-def spooled(stream: BinaryIO, in_memory: int) -> BinaryIO:
-    """Return what is left of a stream that cannot seek as one that can; the caller closes it.
+def spooled(stream: BinaryIO, in_memory: int, *, head: bytes = b"", limit: int | None = None) -> BinaryIO:
+    """Return a stream that cannot seek as one that can; the caller closes it.
+
+    Parameters
+    ----------
+    stream
+        What is left of it is read to its end.
+    in_memory
+        Bytes from which on they wait on the disk.
+    head
+        What was read of it already.
+    limit
+        Bytes that are taken at most, but for `in_memory`; None takes half of the room that temporary files have.
 
     Raises
     ------
     ReadError, WriteError
         The stream cannot be read, or the temporary file cannot be written.
+    LimitExceededError
+        It does not end within the limit.
     """
     copy = tempfile.SpooledTemporaryFile(max_size=in_memory)  # noqa: SIM115 - the caller owns it
     try:
-        shutil.copyfileobj(stream, copy)
+        copy.write(head)
+        _copy(stream, cast("BinaryIO", copy), in_memory, limit)
         copy.seek(0)
     except BaseException as error:
         copy.close()
@@ -306,6 +320,20 @@ def spooled(stream: BinaryIO, in_memory: int) -> BinaryIO:
             raise _spool_error(error) from error
         raise
     return cast("BinaryIO", copy)
+
+
+def _copy(stream: BinaryIO, target: BinaryIO, least: int, limit: int | None) -> None:
+    """Copy a stream to its end; see `spooled`."""
+    folder = tempfile.gettempdir()
+    most = max(least, shutil.disk_usage(folder).free // 2 if limit is None else limit)
+    while part := stream.read(_READ_BYTES):
+        target.write(part)
+        if target.tell() > most:
+            room = f"half of what is free in {folder}" if limit is None else "allowed by --max-memory"
+            raise LimitExceededError(
+                f"the pipe has not ended after {target.tell()} bytes, more than {room}; save it to a file and give that",
+                offset=target.tell(),
+            )
 
 
 def reserve(file: IO[bytes], size: int) -> None:

@@ -7,41 +7,86 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-MAX_BYTES = 64 << 20
-"""A description that is longer is refused; that of 100,000 frames has about 30 MB."""
+import numpy as np
+
+from gsplat_tools.formats._limits import max_memory
+
+ALWAYS_READ = 48 << 20
+"""Memory that a description may take whatever holds it: its bytes, its text and its values, all at once. With what else a
+reader needs that stays within 64 MiB; a sequence of 20,000 frames and a tree of 6,000 leaves in 5 levels take less."""
+
+_MEMORY_A_BYTE = 2  # of a file whose frames are many: each takes several entries, far larger than what describes it
 
 MAX_DEPTH = 256
 """Containers inside containers; trees of levels of detail have some dozens."""
 
-_BYTES_A_VALUE = 40
-_ALWAYS_READ = 32 << 20
+# Bytes that CPython takes for a value: a number and its place in a list that grew, an object of up to five fields, an empty
+# list, half a string (one quote) besides its characters, and a field in an object that grew and among the names known so far.
+_VALUE, _OBJECT, _LIST, _QUOTE, _FIELD = 40, 192, 72, 28, 64
 
 
-def parse(data: bytes, *, parse_constant: Callable[[str], Any] | None = None) -> Any:
+def allowed_memory(available: int) -> int:
+    """Return the memory that the description of a file of `available` bytes may take, its bytes and text included."""
+    return max(ALWAYS_READ, _MEMORY_A_BYTE * available if max_memory() is None else max_memory() or 0)
+
+
+def longest(available: int) -> int:
+    """Return the longest description that is worth reading: its text takes as much again."""
+    return allowed_memory(available) // 2
+
+
+def memory_of(data: bytes) -> int:
+    """Return an upper estimate of the memory that a JSON text takes while it is parsed: bytes, text and values.
+
+    Structure is counted by its signs; strings may hold some too, which only makes the estimate larger.
+    """
+    highest = 0 if data.isascii() else int(np.frombuffer(data, np.uint8).max())
+    # One character of another alphabet makes CPython take two bytes for each, one beyond the first 65,536 takes four.
+    width = 1 if highest < 0xC4 else 2 if highest < 0xF0 else 4
+    characters = width
+    if b"\\" in data:
+        # Escapes hide such characters, and a string with escapes grows by a quarter at a time, until it has to be widened.
+        characters = max(width, (4 if b"\\ud" in data or b"\\uD" in data else 2) if b"\\u" in data else 1)
+        characters = (5 * (1 + characters) + 3) // 4
+    objects, lists = data.count(b"{"), data.count(b"[")
+    structure = (
+        _VALUE * (data.count(b",") + objects + lists)
+        + _OBJECT * objects
+        + _LIST * lists
+        + _QUOTE * data.count(b'"')
+        + _FIELD * data.count(b":")
+    )
+    return len(data) * (1 + width + characters) + structure
+
+
+def parse(data: bytes, *, available: int = 0, parse_constant: Callable[[str], Any] | None = None) -> Any:
     """Return the value of a JSON text.
 
     Parameters
     ----------
     data
         UTF-8, with or without a byte order mark.
+    available
+        Bytes of the file that the text describes and is a part of: a large file may have a large description.
     parse_constant
         Called for NaN and infinities; by default they are taken.
 
     Raises
     ------
     ValueError
-        The bytes are not JSON, or its objects would take far more memory than its text.
+        The bytes are not JSON, or would take more memory than `allowed_memory`.
     """
-    # Commas and brackets count the values; strings may hold some too, which only makes the estimate larger.
-    containers = data.count(b"[") + data.count(b"{")
-    estimate = _BYTES_A_VALUE * (data.count(b",") + containers)
-    if len(data) > MAX_BYTES or estimate > _ALWAYS_READ + 3 * len(data):
-        raise ValueError(f"{len(data)} bytes that hold about {estimate // _BYTES_A_VALUE} values are too many")
+    estimate = memory_of(data)
+    if estimate > allowed_memory(available):
+        raise ValueError(
+            f"{len(data)} bytes that take up to {estimate} in memory are too many; if you trust the file, allow them with "
+            "--max-memory (library: use_max_memory)"
+        )
     try:
         value = json.loads(data.decode("utf-8-sig"), parse_constant=parse_constant)
     except RecursionError:
         raise ValueError(f"more than {MAX_DEPTH} lists and objects inside each other") from None
-    if containers > MAX_DEPTH and _depth(value) > MAX_DEPTH:
+    if data.count(b"[") + data.count(b"{") > MAX_DEPTH and _depth(value) > MAX_DEPTH:
         raise ValueError(f"more than {MAX_DEPTH} lists and objects inside each other")
     return value
 

@@ -24,6 +24,8 @@ MAX_HEADER_BYTES = 1 << 20
 
 _FIRST_READ = 1 << 12
 _LIST_READ = 1 << 20
+_ROWS_TO_REPEAT = 128
+"""Rows with lists of the same lengths after which more of them are looked for at once."""
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -281,10 +283,12 @@ def element_offsets(header: PlyHeader, stream: BinaryIO) -> dict[str, int]:
 
 
 def _end_of_lists(header: PlyHeader, element: PlyElement, stream: BinaryIO, offset: int, size: int) -> int:
-    """Walk through an element with lists and return where it ends."""
+    """Walk through an element with lists and return where it ends; rows with lists of the same lengths at once."""
     buffer, start = b"", offset
     byte_order: Literal["little", "big"] = "big" if header.encoding == "binary_big_endian" else "little"
-    for row in range(element.count):
+    row, repeated, previous = 0, 0, [-1]
+    while row < element.count:
+        first, lengths = offset, []
         for prop in element.properties:
             if prop.count_dtype is None:
                 offset += prop.dtype.itemsize
@@ -297,6 +301,7 @@ def _end_of_lists(header: PlyHeader, element: PlyElement, stream: BinaryIO, offs
             length = int.from_bytes(buffer[place : place + width], byte_order, signed=prop.count_dtype.kind == "i")
             if length < 0:
                 raise CorruptDataError(f"row {row} has a list of length {length}", field=prop.name, offset=offset)
+            lengths.append(length)
             offset += width + length * prop.dtype.itemsize
         if offset > size:
             raise TruncatedDataError(
@@ -304,7 +309,34 @@ def _end_of_lists(header: PlyHeader, element: PlyElement, stream: BinaryIO, offs
                 field=element.name,
                 offset=size,
             )
+        row += 1
+        repeated = repeated + 1 if lengths == previous else 0
+        previous = lengths
+        if repeated >= _ROWS_TO_REPEAT:
+            # No more rows are looked at than were alike so far, so that what is in vain costs no more than what was not.
+            alike = _rows_alike(element, lengths, buffer, first - start, min(repeated, element.count - row))
+            offset += alike * (offset - first)
+            row += alike
+            repeated = repeated + alike if alike else 0
     return offset
+
+
+def _rows_alike(element: PlyElement, lengths: list[int], buffer: bytes, place: int, most: int) -> int:
+    """Return how many rows of the buffer that follow the one at `place` have lists as long as it, at most `most`."""
+    counts: list[int] = []  # bytes of a row that say how long its lists are
+    size, left = 0, iter(lengths)
+    for prop in element.properties:
+        if prop.count_dtype is not None:
+            counts += range(size, size + prop.count_dtype.itemsize)
+            size += prop.count_dtype.itemsize + next(left) * prop.dtype.itemsize
+        else:
+            size += prop.dtype.itemsize
+    most = min(most, (len(buffer) - place) // size - 1)
+    if place < 0 or most < 1:  # the first lists of the row are in the buffer before
+        return 0
+    rows = np.frombuffer(buffer, np.uint8, (most + 1) * size, place).reshape(most + 1, size)[:, counts]
+    is_other = (rows[1:] != rows[0]).any(axis=1)
+    return int(is_other.argmax()) if is_other.any() else most
 
 
 def check_text_claim(header: PlyHeader, stream: BinaryIO) -> None:

@@ -7,6 +7,7 @@ from typing import BinaryIO, cast
 
 from gsplat_tools.errors import TruncatedDataError
 from gsplat_tools.formats._files import spooled
+from gsplat_tools.formats._limits import max_memory
 
 _SPOOL_BYTES = 16 << 20
 
@@ -56,6 +57,21 @@ def stream_size(stream: BinaryIO) -> int:
     return size
 
 
-def seekable(stream: BinaryIO) -> BinaryIO:
-    """Return the stream, or a temporary copy of what is left of it where it cannot seek (pipes)."""
-    return stream if stream.seekable() else spooled(stream, _SPOOL_BYTES)
+def read_up_to(stream: BinaryIO, size: int) -> bytes:
+    """Return `size` bytes, fewer only where the stream ends: pipes give what has arrived."""
+    parts = []
+    while size > 0 and (part := stream.read(size)):
+        parts.append(part)
+        size -= len(part)
+    return b"".join(parts)
+
+
+def seekable(stream: BinaryIO, head: bytes = b"") -> BinaryIO:
+    """Return the stream, or a temporary copy where it cannot seek (pipes): of what was read already, and what is left.
+
+    Raises
+    ------
+    LimitExceededError
+        A pipe does not end within `use_max_memory`, or else within half of the room that there is for temporary files.
+    """
+    return stream if stream.seekable() else spooled(stream, _SPOOL_BYTES, head=head, limit=max_memory())

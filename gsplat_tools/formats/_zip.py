@@ -7,11 +7,14 @@ import zipfile
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import BinaryIO, Literal
 
 from gsplat_tools.errors import CorruptDataError, LimitExceededError, ReadError
+from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import Issue, Rule, raise_errors, refuse
 from gsplat_tools.formats._limits import MAX_EXPANSION, max_memory
+from gsplat_tools.formats._stream import stream_size
 
 Compression = Literal["stored", "deflated"]
 
@@ -60,6 +63,11 @@ class ZipReader:
     repeatable
         Names that may occur again; the last entry counts.
 
+    Attributes
+    ----------
+    length
+        Bytes of the archive.
+
     Raises
     ------
     CorruptDataError, LimitExceededError
@@ -67,6 +75,7 @@ class ZipReader:
     """
 
     def __init__(self, stream: BinaryIO, *, refuses: bool = True, repeatable: Collection[str] = ()) -> None:
+        self.length = stream_size(stream)
         stream.seek(0)
         try:
             self._archive = zipfile.ZipFile(stream)
@@ -77,6 +86,9 @@ class ZipReader:
         issues = list(check_directory(self._archive.infolist(), self._archive.start_dir, repeatable))
         self.issues = raise_errors(issues, RULES) if refuses else issues
         self._last = {info.filename: info for info in self._archive.infolist()}
+        starts = sorted({info.header_offset for info in self._archive.infolist()} | {self._archive.start_dir})
+        self._next_start = dict(pairwise(starts))
+        self._stream = stream
 
     @property
     def names(self) -> list[str]:
@@ -97,6 +109,23 @@ class ZipReader:
     def method(self, name: str) -> str:
         """Return how an entry is compressed."""
         return "stored" if self._last[name].compress_type == zipfile.ZIP_STORED else "deflated"
+
+    def description(self, name: str) -> bytes:
+        """Return the bytes of a JSON entry, for `_json.parse` with the `length` of the archive.
+
+        Raises
+        ------
+        CorruptDataError, LimitExceededError
+            As `read`; it claims more than what may describe an archive of this length.
+        """
+        longest = _json.longest(self.length)
+        if name in self and self.size(name) > longest:
+            message = (
+                f"expected at most {longest} bytes that describe the others, the entry claims {self.size(name)}; "
+                "if you trust the file, allow them with --max-memory (library: use_max_memory)"
+            )
+            raise refuse(Issue(code="zip-entry-size", message=message, field=name), RULES)
+        return self.read(name)
 
     def read(self, name: str, *, frame: int | None = None, at_most: int | None = None) -> bytes:
         """Return the bytes of the last entry of that name.
@@ -122,10 +151,13 @@ class ZipReader:
             message = f"expected at most {at_most} bytes, the entry claims {info.file_size}"
             raise refuse(Issue(code="zip-entry-size", message=message, field=name, frame=frame), RULES)
         try:
+            self._check_place(info, frame)
             # Never more than the record says, whatever the compressed bytes hold; the end is where the CRC is checked.
             with self._archive.open(info) as entry:
                 data = entry.read(info.file_size)
                 entry.read(1)
+        except CorruptDataError:
+            raise
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError, RuntimeError) as error:
             raise_read_error(error)
             issue = Issue(code="zip-entry-corrupt", message=f"the entry does not decompress ({error})", field=name, frame=frame)
@@ -134,6 +166,23 @@ class ZipReader:
             message = f"the entry holds {len(data)} bytes, its record says {info.file_size}"
             raise refuse(Issue(code="zip-entry-corrupt", message=message, field=name, frame=frame), RULES)
         return data
+
+    def _check_place(self, info: zipfile.ZipInfo, frame: int | None) -> None:
+        """Refuse an entry whose local header moves its data into what follows; zipfile looks at that from 3.12 on.
+
+        The header lies before the data: looking at those of all entries at once would go through the whole file.
+        """
+        with self._archive._lock:  # type: ignore[attr-defined]  # entries that are read in other threads seek too
+            self._stream.seek(info.header_offset)
+            header = self._stream.read(_LOCAL_HEADER)
+        if len(header) < _LOCAL_HEADER:
+            return  # zipfile says that it is cut off
+        end = info.header_offset + _LOCAL_HEADER + sum(struct.unpack_from("<HH", header, 26)) + info.compress_size
+        limit = self._next_start.get(info.header_offset, self._archive.start_dir)
+        if end > limit:
+            message = f"the entry shares bytes with what follows: it ends at {end}, the next one starts at {limit}"
+            issue = Issue(code="zip-overlap", message=message, field=info.filename, frame=frame, offset=info.header_offset)
+            raise refuse(issue, RULES)
 
 
 def raise_read_error(error: BaseException) -> None:
@@ -165,8 +214,9 @@ def check_directory(entries: list[zipfile.ZipInfo], directory_offset: int, repea
     seen: set[str] = set()
     for info in entries:
         name = info.filename
-        if not is_relative_name(name.removesuffix("/")):
-            yield Issue(code="zip-bad-name", message=f"expected a relative name, found {name!r}"[:200], field=name)
+        whole = info.orig_filename  # zipfile cuts names at a NUL
+        if not is_relative_name(whole.removesuffix("/")):
+            yield Issue(code="zip-bad-name", message=f"expected a relative name, found {whole!r}"[:200], field=name)
         if name in seen:
             code = "zip-repeated" if name in repeatable else "zip-duplicate"
             yield Issue(code=code, message="the name occurs again; the last entry counts", field=name)
@@ -191,7 +241,7 @@ def check_directory(entries: list[zipfile.ZipInfo], directory_offset: int, repea
     ordered = sorted(entries, key=lambda info: (info.header_offset, info.compress_size))
     places = [(info.header_offset, repr(info.filename)) for info in ordered] + [(directory_offset, "the directory")]
     for before, (start, name) in zip(ordered, places[1:], strict=True):
-        # The local header may be longer than this by its extra field, which zipfile looks at when it opens the entry.
+        # The local header may be longer than this by its extra field, which is looked at when the entry is read.
         if before.header_offset + _LOCAL_HEADER + before.compress_size > start:
             yield Issue(
                 code="zip-overlap",

@@ -18,7 +18,7 @@ from gsplat_tools.errors import CapabilityError, GsplatError, NonFiniteWarning, 
 from gsplat_tools.formats._companion import attach, path_of, read_beside
 from gsplat_tools.formats._files import open_source_file
 from gsplat_tools.formats._stores import is_url
-from gsplat_tools.formats._stream import seekable
+from gsplat_tools.formats._stream import read_up_to, seekable
 from gsplat_tools.formats.base import SNIFF_BYTES, FileInfo, Format, Scene
 from gsplat_tools.formats.registry import FORMATS, detect, find_format
 from gsplat_tools.sequence import GaussianSequence
@@ -52,7 +52,9 @@ def open_source(path: Path) -> tuple[BinaryIO, Format]:
     try:
         if not stream.seekable():
             with stream as pipe:
-                stream = seekable(pipe)
+                head = read_up_to(pipe, SNIFF_BYTES)
+                detect(head, path)  # what no format claims is not copied
+                stream = seekable(pipe, head)
         head = stream.read(SNIFF_BYTES)
         stream.seek(0)
         return stream, _with_companion(stream, path, detect(head, path), head)

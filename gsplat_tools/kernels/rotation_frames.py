@@ -5,7 +5,7 @@ Frame f turns quaternion q into q FRAME_QUATS[f] and log scales s into s[FRAME_A
 
 import numpy as np
 
-from gsplat_tools.kernels._jit import kernel
+from gsplat_tools.kernels._jit import device, kernel
 
 _H = np.sqrt(0.5)
 FRAME_QUATS = np.array(
@@ -47,6 +47,15 @@ _QUATS_F32 = FRAME_QUATS.astype(np.float32)
 LANES = 64
 
 
+@device()
+def fitting_scale(w, x, y, z):
+    """Return the power of two that leaves room in float32 for sums of these; 1.0 for all but the longest and shortest."""
+    longest = max(abs(np.float64(w)), abs(np.float64(x)), abs(np.float64(y)), abs(np.float64(z)))
+    if longest >= 2.0**125:
+        return 2.0**-100
+    return 2.0**100 if longest < 2.0**-60 else 1.0
+
+
 @kernel()
 def frames_of_largest_w(quats, frames):
     """The frame whose quaternion has the largest |w|, the smallest turn; ties take the first frame.
@@ -61,8 +70,9 @@ def frames_of_largest_w(quats, frames):
         count = min(LANES, quats.shape[0] - start)
         for j in range(LANES):
             i = start + (j if j < count else 0)
+            scale = np.float32(fitting_scale(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]))
             for k in range(4):
-                lanes[k, j] = quats[i, k]
+                lanes[k, j] = quats[i, k] * scale
             best[j] = np.float32(-1)
             best_frame[j] = np.int32(0)
         for f in range(24):
@@ -81,7 +91,7 @@ def frames_of_largest_w(quats, frames):
 def apply_frames(quats, log_scales, frames, out_quats, out_log_scales):
     """Turn quaternions and permute log scales.
 
-    quats           float32 (N, 4)  read, wxyz
+    quats           float32 (N, 4)  read, wxyz, any length; the longest and shortest come out in another
     log_scales      float32 (N, 3)  read
     frames          uint8 (N,)      read, 0..23
     out_quats       float32 (N, 4)  written; may alias quats
@@ -90,6 +100,8 @@ def apply_frames(quats, log_scales, frames, out_quats, out_log_scales):
     for i in range(quats.shape[0]):
         f = np.int64(frames[i])
         w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        scale = fitting_scale(w, x, y, z)
+        w, x, y, z = w * scale, x * scale, y * scale, z * scale
         a, b, c, d = FRAME_QUATS[f, 0], FRAME_QUATS[f, 1], FRAME_QUATS[f, 2], FRAME_QUATS[f, 3]
         out_quats[i, 0] = np.float32(w * a - x * b - y * c - z * d)
         out_quats[i, 1] = np.float32(w * b + x * a + y * d - z * c)

@@ -8,7 +8,7 @@ order: they err alike, and the one that leaves w largest is taken. Six candidate
 import numpy as np
 
 from gsplat_tools.kernels._jit import kernel
-from gsplat_tools.kernels.rotation_frames import FRAME_AXES, FRAME_QUATS
+from gsplat_tools.kernels.rotation_frames import FRAME_AXES, FRAME_QUATS, fitting_scale
 
 LANES = 64
 
@@ -159,7 +159,8 @@ def sorted_frames(quats, log_scales, frames):
             longest, shortest = 0, 1
         c = _CANDIDATE_OF_ORDER[9 * longest + 3 * shortest + (3 - longest - shortest)]
         a, b, e, f = _QUATS[c, 0], _QUATS[c, 1], _QUATS[c, 2], _QUATS[c, 3]
-        qw, qx, qy, qz = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        scale = np.float32(fitting_scale(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]))
+        qw, qx, qy, qz = quats[i, 0] * scale, quats[i, 1] * scale, quats[i, 2] * scale, quats[i, 3] * scale
         sizes = (
             abs(qw * a - qx * b - qy * e - qz * f),
             abs(qw * b + qx * a + qy * f - qz * e),

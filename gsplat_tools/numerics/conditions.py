@@ -174,6 +174,9 @@ def _rotations() -> Iterator[Condition]:
         "length 1e30": 1e30 * quaternions.normalize(rng.normal(size=(SPLATS, 4))),
     }
     logs = np.log([1.0, 0.3, 0.1]) - 3 + rng.uniform(-0.05, 0.05, (SPLATS, 3))
+    rows = rng.normal(size=(SPLATS, 4))
+    rows /= np.abs(rows).max(axis=1, keepdims=True)
+    cases |= {f"largest component {size:g}": size * rows for size in (1e-41, 3e38)}
     for label, quats in cases.items():
         yield Condition("rotation", label, None, ("covariances",), ordinary(quats=quats, log_scales=logs))
 

@@ -157,9 +157,10 @@ def measure_cloud(
     names = None if watched is None else tuple(watched)
     try:
         done = transfer(cloud, record)
+        # Frames are read when they are asked for, and may be refused only then.
+        source, decoded = _frame(done.prepared), _frame(done.decoded)
     except GsplatError as error:
         return [Row(**facts, attribute=name, note=f"refused: {error.message}") for name in names or ("all",)]
-    source, decoded = _frame(done.prepared), _frame(done.decoded)
     if len(source) != len(decoded) or len(source) != len(cloud):
         lost = f"{len(cloud)} splats, {len(source)} written, {len(decoded)} read"
         return [Row(**facts, attribute="splats", within=False, note=lost)]

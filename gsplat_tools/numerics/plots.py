@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
 
@@ -186,9 +187,15 @@ def _x_axis(values: list[float]) -> tuple[Place, list[float]]:
 
 
 def _y_axis(values: list[float]) -> tuple[Place, list[float]]:
-    """Return places and marks up a panel, logarithmic; 0 lies on the lower edge, what is beyond the decades on the upper."""
-    low = math.log10(min(values, default=1e-3))
-    high = min(math.log10(max(values, default=1.0)), low + _MAX_DECADES)
+    """Return places and marks up a panel, logarithmic, of the decades that hold most values.
+
+    0 and what is below them lie on the lower edge, what is above on the upper.
+    """
+    exponents = sorted(math.log10(value) for value in values) or [-3.0, 0.0]
+    within = [bisect_right(exponents, exponent + _MAX_DECADES) for exponent in exponents]
+    # Of windows that hold as many the highest: the largest errors matter most.
+    start = max(range(len(exponents)), key=lambda i: (within[i] - i, i))
+    low, high = exponents[start], exponents[within[start] - 1]
     if high - low < 1:
         low, high = low - 0.5, high + 0.5
     span = high - low
@@ -196,7 +203,8 @@ def _y_axis(values: list[float]) -> tuple[Place, list[float]]:
     def place(value: float) -> float:
         if value <= 0:
             return float(_PANEL_HEIGHT)
-        return _PANEL_HEIGHT * (0.92 - 0.87 * min((math.log10(value) - low) / span, 1.05))
+        share = (math.log10(value) - low) / span
+        return min(_PANEL_HEIGHT * (0.92 - 0.87 * min(share, 1.05)), float(_PANEL_HEIGHT))
 
     return place, _decades(low, high, 6)
 

@@ -59,9 +59,8 @@ def synthetic_rows(names: Iterable[str] | None = None, sweeps: Iterable[str] | N
                 progress.advance(1)
             if record.holds_sequences and (wanted is None or timelines.SWEEP in wanted):
                 rows += timelines.sequence_rows(record)
-    for point in points:
-        if point.sweep == "needle":
-            rows.append(halves.vanishing_row(point))
+    if halves.FORMAT in {record.id for record in formats}:
+        rows += [halves.vanishing_row(point) for point in points if point.sweep == "needle"]
     return rows
 
 
@@ -98,7 +97,9 @@ def scene_rows(path: str | Path, names: Iterable[str] | None = None, *, max_spla
         for record in formats:
             rows += measure_cloud(_fitting(cloud, record), record, label=label)
             progress.advance(1)
-    return [*rows, halves.half_row(cloud, "scene", label)]
+    if halves.FORMAT in {record.id for record in formats}:
+        rows.append(halves.half_row(cloud, "scene", label))
+    return rows
 
 
 def _fitting(cloud: GaussianCloud, record: Format) -> GaussianCloud:

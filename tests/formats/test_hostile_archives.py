@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import zlib
 from dataclasses import replace
 from typing import Any
 
@@ -81,13 +82,34 @@ def test_description_that_is_deep__is_refused(depth: int) -> None:
         read_sog(io.BytesIO(archive(files)), SogReadOptions())
 
 
-@pytest.mark.parametrize("name", [b"/etc/passwd", b"../q.webp", b"a/../../b", b"C:\\x", b"a\\b"])
+@pytest.mark.parametrize("name", [b"/etc/passwd", b"../q.webp", b"a/../../b", b"C:\\x", b"a\\b", b"a\0b"])
 def test_name_that_leads_away__is_refused(name: bytes) -> None:
     data = zip_file([*entries_of(archive(version_2(0))), Entry(name, b"x")])
 
     with pytest.raises(CorruptDataError, match="relative name") as caught:
         read_sog(io.BytesIO(data), SogReadOptions())
     assert caught.value.code == "zip-bad-name"  # type: ignore[attr-defined]
+
+
+def test_data_that_a_local_header_moves_into_the_next_entry__are_refused() -> None:
+    # zipfile of Python 3.11 takes them: what a scanner of the entries sees is not what is read.
+    hidden = b"what is read"
+    shown = Entry(b"a", b"what is seen", local_extra=len(hidden) + 30 + 1)
+    data = zip_file([replace(shown, crc=zlib.crc32(hidden)), Entry(b"b", hidden), Entry(b"c", b"x")])
+    reader = ZipReader(io.BytesIO(data))
+
+    with pytest.raises(CorruptDataError, match="shares bytes") as caught:
+        reader.read("a")
+    assert (caught.value.field, caught.value.offset) == ("a", 0)
+    assert caught.value.code == "zip-overlap"  # type: ignore[attr-defined]
+    assert (reader.read("b"), reader.read("c")) == (hidden, b"x")
+
+
+def test_data_that_a_local_header_moves_into_the_directory__are_refused() -> None:
+    data = zip_file([Entry(b"a", b"abc"), Entry(b"b", b"abc", local_extra=3)])
+
+    with pytest.raises(CorruptDataError, match="shares bytes"):
+        ZipReader(io.BytesIO(data)).read("b")
 
 
 def test_folder_entries__are_legal() -> None:

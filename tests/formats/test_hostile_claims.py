@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import time
 import warnings
 from pathlib import Path
@@ -16,7 +15,6 @@ from click.testing import CliRunner
 import gsplat_tools
 from gsplat_tools.errors import CorruptDataError, FormatError, GsplatError, GsplatWarning, LimitExceededError
 from gsplat_tools.formats import FORMATS, use_max_memory
-from gsplat_tools.formats import _json as json_text
 from gsplat_tools.formats import _limits as limits
 from gsplat_tools.formats.ply import inspect as inspect_ply
 from gsplat_tools.formats.ply import read as read_ply
@@ -152,22 +150,6 @@ def test_repair_that_fails__leaves_no_archive_behind() -> None:
         FORMATS["sog4d"].repair(io.BytesIO(bytes(data)), target)  # type: ignore[misc]
     target.close()
     gc.collect()  # pytest reports what is raised in here
-
-
-def test_json__is_taken_up_to_its_limits() -> None:
-    deep = b"[" * json_text.MAX_DEPTH + b"]" * json_text.MAX_DEPTH
-    assert json_text.parse(deep)
-    assert json_text.parse(b"\xef\xbb\xbf[1]") == [1]
-    for text in (b"[" + deep + b"]", b"[" * 100_000, b"[" + b"[]," * 2_000_000 + b"[]]", b'"' + b" " * (65 << 20) + b'"'):
-        with pytest.raises(ValueError, match=r"inside each other|too many"):
-            json_text.parse(text)
-
-
-def test_json_of_100_000_frames__is_taken() -> None:
-    vector = {"x": -1.2345678901, "y": 0.123456789, "z": 1e-9}
-    text = json.dumps({"rangeMin": [vector] * 100_000, "rangeMax": [vector] * 100_000, "times": [0.12345] * 100_000})
-
-    assert len(json_text.parse(text.encode())["rangeMin"]) == 100_000
 
 
 def test_error__shows_hostile_names_so_that_a_terminal_does_not_obey() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 
 import numpy as np
 import pytest
@@ -119,3 +120,35 @@ def test_element_offsets__refuses_lists_of_negative_length():
         element_offsets(read_header(io.BytesIO(data)), io.BytesIO(data))
 
     assert (caught.value.field, caught.value.offset) == ("ids", start)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_element_offsets__end_lists_whatever_rows_repeat(seed: int) -> None:
+    # Runs of rows alike are skipped at once, here across reads of the file too.
+    rng = np.random.default_rng(seed)
+    header = b"ply\nformat binary_little_endian 1.0\nelement face %d\nproperty list uchar short a\nproperty uchar b\n"
+    header += b"property list ushort uchar c\nelement vertex 0\nproperty float x\nend_header\n"
+    rows = []
+    while len(rows) < 200_000:
+        a, c = (int(n) for n in rng.integers(0, 3, 2))
+        row = bytes([a]) + bytes(2 * a) + b"\7" + bytes([c, 0]) + bytes(c)
+        rows += [row] * int(rng.choice([1, 2, 130, 300, 30_000]))
+    body = b"".join(rows)
+    whole = header.replace(b"%d", b"%d" % len(rows)) + body
+    stream = io.BytesIO(whole)
+
+    offsets = element_offsets(read_header(stream), stream)
+
+    assert offsets == {"face": len(whole) - len(body), "vertex": len(whole)}
+
+
+def test_element_offsets__of_many_empty_lists_take_no_time() -> None:
+    count = 3_000_000
+    header = b"ply\nformat binary_little_endian 1.0\nelement face %d\nproperty list uchar int a\nend_header\n" % count
+    stream = io.BytesIO(header + bytes(count))
+    parsed = read_header(stream)
+
+    start = time.process_time()
+    element_offsets(parsed, stream)
+
+    assert time.process_time() - start < 0.5

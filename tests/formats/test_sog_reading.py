@@ -340,3 +340,14 @@ def test_level_that_is_not_there__is_the_callers_fault(tmp_path: Path) -> None:
         load(lod_scene(tmp_path), lod=2)
     with pytest.raises(CapabilityError, match="lod=1"):
         decode(version_2(), lod=1)
+
+
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [(b"", "found an empty one"), (b"#!/bin/sh\n" + archive(version_2(0)), r"starts with b'#!/bin/sh"), (b"\x89PNG", "PNG")],
+)
+def test_file_that_is_neither_archive_nor_json__is_said_to_be(data: bytes, found: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.sog").write_bytes(data)
+
+    with pytest.raises(CorruptDataError, match=f"expected a ZIP archive or a meta.json, .*{found}"):
+        load(tmp_path / "scene.sog")

@@ -41,6 +41,7 @@ class Entry:
     offset: int | None = None
     local_name: bytes | None = None
     extra: bytes = b""
+    local_extra: int = 0  # how long the local header says that its extra field is; the data follow at once
 
 
 def deflated(data: bytes) -> bytes:
@@ -69,7 +70,9 @@ def zip_file(
         offset = len(body) if entry.offset is None else entry.offset
         name = entry.name if entry.local_name is None else entry.local_name
         fields = struct.pack("<HHHH", entry.flags, entry.method, 0, 0x21) + sizes
-        body += b"PK\x03\x04" + struct.pack("<H", 20) + fields + struct.pack("<HH", len(name), 0) + name + stored
+        body += (
+            b"PK\x03\x04" + struct.pack("<H", 20) + fields + struct.pack("<HH", len(name), entry.local_extra) + name + stored
+        )
         lengths = struct.pack("<HHHHHII", len(entry.name), len(entry.extra), 0, 0, 0, 0, offset & 0xFFFFFFFF)
         directory += b"PK\x01\x02" + struct.pack("<HH", 20, 20) + fields + lengths + entry.name + entry.extra
     number = len(entries) if count is None else count

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tests.hostile import rebuilders
+from tests.hostile.large_json import large_bundles
 
 Named = Iterator[tuple[str, bytes]]
 
@@ -290,6 +291,7 @@ def sog() -> Named:
 
     for text in (b"[]", b"1", b"{}", b"{", b"[" * 300 + b"]" * 300, b"[" + b"0," * 1_000_000 + b"0]"):
         yield f"meta.json {text[:20]!r}", archive(version_2(0) | {"meta.json": text})
+    yield from large_bundles("sog")
     for bands in (1, 2, 3):
         yield f"version 1, {bands} bands", archive(version_1(bands))
         yield f"version 2, {bands} bands", archive(version_2(bands))
@@ -372,6 +374,7 @@ def sog4d() -> Named:
 
     for text in (b"[]", b"1", b"{}", b"[" * 300 + b"]" * 300, b"[" + b"0," * 1_000_000 + b"0]"):
         yield f"meta.json {text[:20]!r}", bundles.archive(text, bundles.valid_files())
+    yield from large_bundles("sog4d")
 
     def without_bands(meta: Any) -> None:
         sh = meta["streams"]["sh"]

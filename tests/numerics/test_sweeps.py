@@ -110,6 +110,15 @@ def test_positions__with_an_origin_are_measured_in_the_world() -> None:
     assert kept.measured_max == 0
 
 
+def test_half_rows__are_those_of_their_format(tmp_path: Path) -> None:
+    save(random_cloud(20, sh_degree=0), tmp_path / "scene.ply")
+
+    for names, expected in (["spz"], set()), (["spz", "visionary-f16"], {"visionary-f16"}):
+        rows = [*synthetic_rows(names, ["needle"]), *scene_rows(tmp_path / "scene.ply", names)]
+        assert {row.format for row in rows if row.attribute.startswith("vanished")} == expected
+        assert {row.format for row in rows} == set(names)
+
+
 def test_half_row__counts_needles_that_lose_their_minor_axis() -> None:
     thick = half_row(ordinary(log_scales=np.full((96, 3), -3.0)), "needle", "1")
     thin = half_row(ordinary(log_scales=np.tile([0.0, -9.0, -9.0], (96, 1))), "needle", "8e3")
@@ -154,6 +163,28 @@ def test_plots__are_one_file_without_links() -> None:
         assert "nan" not in text
     assert "&#215;<title>refused" in svg
     assert svg.startswith("<svg xmlns=")
+
+
+@pytest.mark.parametrize(
+    ("errors", "shown"),
+    [
+        ([1e-45, 1e-30, 1e-4, 2e-3, 2e-3, 2e-3], [1e-4, 2e-3]),  # opacities of huge logits
+        ([1e-3, 2e-3, 1e-2, 1e78], [1e-3, 1e-2]),  # covariances of splats that grew from nothing
+    ],
+)
+def test_plots__show_the_decades_that_hold_most_values(errors: list[float], shown: list[float]) -> None:
+    rows = [
+        Row(format="x", attribute="a", condition="c", sweep="s", x=float(i + 1), measured_max=error, bound=error, within=True)
+        for i, error in enumerate(errors)
+    ]
+
+    places = [float(y) for y in re.findall(r'<circle cx="[^"]*" cy="([^"]*)"', plot_svg(rows))]
+
+    inside = [place for place, error in zip(places, errors, strict=True) if shown[0] <= error <= shown[1]]
+    assert max(inside) - min(inside) > 40
+    for place, error in zip(places, errors, strict=True):  # y grows downwards
+        assert place > max(inside) or error >= shown[0]
+        assert place < min(inside) or error <= shown[1]
 
 
 def test_command__prints_json_and_writes_a_plot(tmp_path: Path) -> None:

@@ -26,6 +26,40 @@ def convert(source: Path, target: Path, *options: str, limit: int | None = None)
     )
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("convert", ["--help"]),
+        ("inspect", ["--version"]),
+        ("inspect", ["info", "--help"]),
+        ("inspect", ["info", "FILE", "--json"]),
+        ("inspect", ["info", "FILE"]),
+    ],
+)
+def test_full_stdout__is_one_line(command: str, arguments: list[str], source: Path) -> None:
+    program = f"from gsplat_tools.cli.{command} import main; main()"
+    arguments = [str(source) if each == "FILE" else each for each in arguments]
+
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", program, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+
+    assert done.stderr.splitlines() == ["error: standard output: cannot write: No space left on device"]
+    assert done.returncode == 1
+
+
+def test_summary__escapes_names_of_files(source: Path, tmp_path: Path) -> None:
+    odd = source.rename(tmp_path / "a\n\x1b[31mb.ply")
+
+    done = convert(odd, tmp_path / "c\x1b[0md.ply", "--no-validate")
+
+    assert done.returncode == 0, done.stderr
+    assert "\x1b" not in done.stderr
+    assert done.stderr.splitlines()[0] == f"{tmp_path}/a \\x1b[31mb.ply -> {tmp_path}/c\\x1b[0md.ply (ply)"
+
+
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     case = next(case for case in cases() if case.id == "ply")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
@@ -11,6 +12,7 @@ import threading
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,8 +20,8 @@ import pytest
 
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.convert import Validation, convert
-from gsplat_tools.errors import CorruptDataError, GsplatWarning, ReadError, UnknownFormatError
-from gsplat_tools.formats import _files, load
+from gsplat_tools.errors import CorruptDataError, GsplatWarning, LimitExceededError, ReadError, UnknownFormatError
+from gsplat_tools.formats import _files, load, use_max_memory
 from gsplat_tools.formats.loading import inspect_file, open_scene
 from gsplat_tools.formats.registry import FORMATS
 from gsplat_tools.sequence import GaussianSequence
@@ -97,6 +99,45 @@ def test_pipe__gives_the_same_scene(case: Case, size: int, tmp_path: Path, monke
     feeder.join()
 
     assert_same(found, expected)
+
+
+def endless(path: Path, head: bytes) -> threading.Thread:
+    """Write a head and then zeros into a FIFO until its reader goes away."""
+    os.mkfifo(path)
+
+    def feed() -> None:
+        with contextlib.suppress(BrokenPipeError), path.open("wb", buffering=0) as pipe:
+            pipe.write(head)
+            while True:
+                pipe.write(bytes(1 << 20))
+
+    thread = threading.Thread(target=feed, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_endless_pipe__of_no_format_is_refused_by_its_first_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsplat_tools.formats.loading.seekable", lambda *_: pytest.fail("it was copied"))
+    feeder = endless(tmp_path / "scene", b"nothing known")
+
+    with pytest.raises(UnknownFormatError, match="no format claims"):
+        load(tmp_path / "scene")
+    feeder.join(20)
+    assert not feeder.is_alive()
+
+
+def test_endless_pipe__with_a_signature_is_read_up_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    places = [tmp_path / "one.ply", tmp_path / "two.ply"]
+    feeders = [endless(place, b"ply\nformat binary_little_endian 1.0\n") for place in places]
+
+    with use_max_memory(20 << 20), pytest.raises(LimitExceededError, match=r"has not ended .* --max-memory"):
+        load(places[0])
+    monkeypatch.setattr(_files.shutil, "disk_usage", lambda _: SimpleNamespace(free=40 << 20))
+    with pytest.raises(LimitExceededError, match=r"half of what is free .* save it to a file"):
+        load(places[1])
+    for feeder in feeders:
+        feeder.join(20)
+        assert not feeder.is_alive()
 
 
 @pytest.mark.parametrize("case", [c for c in PIPED if c.id in {"spz", "sog4d-sequence"}], ids=lambda case: case.id)

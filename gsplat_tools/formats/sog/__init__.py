@@ -71,7 +71,7 @@ def inspect(stream: BinaryIO) -> FileInfo:
             },
         )
     assert folder is not None
-    scene = lod.parse_lod(stream.read(), folder)
+    scene = lod.parse_lod(lod.read_text(stream), folder)
     bundles = [bundle for bundle, _ in scene.bundles(0)]
     return FileInfo(
         version="lod 1",

@@ -199,6 +199,11 @@ class Bundle:
             return _webp.decode_rgba(data, header.width, header.height, field=path)
 
 
+_JSON_SPACE = b"\xef\xbb\xbf \t\r\n"
+_JSON_STARTS = frozenset(bytes([byte]) for byte in b'{["-0123456789tfnNI')
+"""What a JSON text starts with, objects and all else."""
+
+
 def open_bundle(stream: BinaryIO) -> tuple[Bundle | None, Folder | None]:
     """Return the scene of a .sog archive or of a folder's meta.json; (None, its folder) for a lod-meta.json.
 
@@ -207,19 +212,23 @@ def open_bundle(stream: BinaryIO) -> tuple[Bundle | None, Folder | None]:
     FormatError
         The archive or meta.json breaks a rule.
     """
-    head = stream.read(2)
+    head = stream.read(64)
     stream.seek(0)
-    if head == b"PK":
+    if head[:2] == b"PK":
         archive = ZipReader(stream)
         prefix = _prefix(archive)
         if prefix + META_NAME not in archive:
             message = f"expected a meta.json at the root of the archive, found {len(archive.names)} other entries"
             raise fault("meta-missing", message, META_NAME)
-        bundle = Bundle(archive, parse_meta(archive.read(prefix + META_NAME, at_most=_json.MAX_BYTES)), prefix)
+        bundle = Bundle(archive, parse_meta(archive.description(prefix + META_NAME), available=archive.length), prefix)
         check_count(bundle.meta, stream_size(stream))
         return bundle, None
+    if head.lstrip(_JSON_SPACE)[:1] not in _JSON_STARTS:
+        found = f"one that starts with {head[:16]!r}" if head else "an empty one"
+        message = f"expected a ZIP archive or a meta.json, found {found}; copy or download the file again"
+        raise fault("zip-invalid", message, "archive")
     folder = folder_of(stream)
-    data = stream.read(_json.MAX_BYTES + 1)
+    data = stream.read(_json.longest(0) + 1)
     stream.seek(0)
     if is_lod(data):
         return None, folder

@@ -12,7 +12,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, GsplatWarning
 from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats.sog.bundle import Bundle, check_indices, open_bundle
-from gsplat_tools.formats.sog.lod import parse_lod
+from gsplat_tools.formats.sog.lod import parse_lod, read_text
 from gsplat_tools.formats.sog.options import SogReadOptions
 from gsplat_tools.parallel import map_ordered
 
@@ -47,7 +47,7 @@ def read(stream: BinaryIO, options: SogReadOptions) -> GaussianCloud:
             raise CapabilityError(f"this scene has no levels of detail but 0, got lod={options.lod}")
         return decode(bundle)
     assert folder is not None
-    return parse_lod(stream.read(), folder).read(options.lod, decode)
+    return parse_lod(read_text(stream), folder).read(options.lod, decode)
 
 
 def decode(bundle: Bundle) -> GaussianCloud:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, CloudError, LossyConversionWarning
 from gsplat_tools.formats import _webp
+from gsplat_tools.formats._palettes import check_range
 from gsplat_tools.formats._webp import MAX_SIDE, Image
 from gsplat_tools.formats._zip import ZipWriter
 from gsplat_tools.formats.sog.codebooks import FLAT_STEP, Palette, fit_colors, fit_palette, fit_scales, sample_rows
@@ -250,3 +251,4 @@ def _check(cloud: GaussianCloud) -> None:
         if is_bad.any():
             message = f"{int(is_bad.sum())} of {len(cloud)} splats hold NaN or a scale beyond float32; drop them first"
             raise CloudError(message, field=name)
+    check_range(cloud.shN)

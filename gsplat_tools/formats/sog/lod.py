@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 from gsplat_tools.cloud import GaussianCloud, concatenate
 from gsplat_tools.errors import CapabilityError
@@ -109,13 +109,18 @@ class LodScene:
             archive = ZipReader(io.BytesIO(data))
             if META_NAME not in archive:
                 raise fault("meta-missing", "expected a meta.json at the root of the archive", name)
-            meta = parse_meta(archive.read(META_NAME, at_most=_json.MAX_BYTES), f"{name} {META_NAME}")
+            meta = parse_meta(archive.description(META_NAME), f"{name} {META_NAME}", available=archive.length)
             check_count(meta, len(data))
             return Bundle(archive, meta)
         parent = str(PurePosixPath(name).parent)
         bundle = Bundle(self.folder, parse_meta(data, name), "" if parent == "." else parent + "/")
         check_count(bundle.meta, bundle.stored_bytes())
         return bundle
+
+
+def read_text(stream: BinaryIO) -> bytes:
+    """Return the bytes of a lod-meta.json, of one that is too long only as many as `parse_lod` needs to refuse it."""
+    return stream.read(_json.longest(0) + 1)
 
 
 def parse_lod(data: bytes, folder: Folder) -> LodScene:

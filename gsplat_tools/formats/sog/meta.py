@@ -90,8 +90,8 @@ class Meta:
         return self.bands != 0
 
 
-def parse_json(data: bytes, name: str) -> dict[str, Any]:
-    """Return a JSON object.
+def parse_json(data: bytes, name: str, available: int = 0) -> dict[str, Any]:
+    """Return a JSON object; `available` bytes of what it describes bound the memory that it may take.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def parse_json(data: bytes, name: str) -> dict[str, Any]:
         The bytes are something else.
     """
     try:
-        root = _json.parse(data)
+        root = _json.parse(data, available=available)
     except ValueError as error:
         raise fault("meta-json", f"expected a JSON object ({error})", name) from error
     if not isinstance(root, dict):
@@ -107,7 +107,7 @@ def parse_json(data: bytes, name: str) -> dict[str, Any]:
     return root
 
 
-def parse_meta(data: bytes, name: str = META_NAME) -> Meta:
+def parse_meta(data: bytes, name: str = META_NAME, *, available: int = 0) -> Meta:
     """Return what meta.json says.
 
     Parameters
@@ -116,6 +116,8 @@ def parse_meta(data: bytes, name: str = META_NAME) -> Meta:
         The file.
     name
         What errors call it.
+    available
+        Bytes of its archive, which bound the memory that it may take.
 
     Raises
     ------
@@ -124,7 +126,7 @@ def parse_meta(data: bytes, name: str = META_NAME) -> Meta:
     UnsupportedVersionError
         It is of another version.
     """
-    root = Fields(parse_json(data, name), name)
+    root = Fields(parse_json(data, name, available), name)
     version = root.value.get("version")
     if version is None and "version" not in root.value:
         return _version_1(root)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_tools.errors import FormatError
-from gsplat_tools.formats import _json, _webp
+from gsplat_tools.formats import _webp
 from gsplat_tools.formats._issues import Issue, raise_errors, refuse
 from gsplat_tools.formats._limits import splat_bytes, too_much
 from gsplat_tools.formats._stream import stream_size
@@ -159,7 +159,7 @@ def read_meta(archive: ZipReader) -> tuple[Meta, list[Issue]]:
     if "meta.json" not in archive:
         message = f"expected a meta.json at the root of the archive, found {len(archive.names)} other entries"
         raise refuse(Issue(code="meta-missing", message=message, field="meta.json"), RULES)
-    meta, issues = parse_meta(archive.read("meta.json", at_most=_json.MAX_BYTES))
+    meta, issues = parse_meta(archive.description("meta.json"), archive.length)
     rest = raise_errors(issues, RULES)
     assert meta is not None
     return meta, rest

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gsplat_tools.cloud import REST_COEFFICIENTS, GaussianCloud
 from gsplat_tools.constants import SH_C0
 from gsplat_tools.errors import CloudError
+from gsplat_tools.formats._palettes import check_range, stored_entries
 from gsplat_tools.formats.sog4d import balancing
 from gsplat_tools.formats.sog4d.options import Sog4dOptions
 from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, SH0_ENTRIES
@@ -29,7 +30,6 @@ MIN_LOG = -27.0
 """Floor of `scale_coordinates`: e^-27 world units, 2e-12, below which all scales are the same."""
 
 _MAX_LOG = 88.0
-_MAX_HALF = np.float32(65504)
 
 _PROBES = 8192
 
@@ -316,7 +316,7 @@ def _fit_palettes(sample: Sample, bands: int, num_splats: int, options: Sog4dOpt
         centroids = fit_palette(points, weights, size=size, max_rounds=options.palette_rounds)
         probe = points[:: max(1, len(points) // _PROBES)]
         step = _grid_step(float(nearest_labels(probe, centroids)[1].mean(dtype=np.float64)) / points.shape[1])
-        stored = _stored_centroids(centroids, step, options)
+        stored = _stored_centroids(centroids, step, options, name)
         error = float(nearest_labels(probe, stored)[1].mean(dtype=np.float64))
         palettes.append(Palette(name, first, coefficients, stored, error))
     return tuple(palettes)
@@ -327,11 +327,10 @@ def _grid_step(error: float) -> float:
     return 2.0 ** np.floor(np.log2(_CENTROID_GRID * np.sqrt(error))) if error > 0 else 0.0
 
 
-def _stored_centroids(centroids: Float32, step: float, options: Sog4dOptions) -> Float32:
+def _stored_centroids(centroids: Float32, step: float, options: Sog4dOptions, name: str) -> Float32:
     """Return centroids as the file holds them: distinct, short vectors first, on a grid that deflates well."""
     on_grid = np.rint(centroids / np.float32(step)) * np.float32(step) if step > 0 else centroids
-    stored = np.clip(on_grid, -_MAX_HALF, _MAX_HALF).astype("<f2" if options.centroids == "f16" else "<f4")
-    distinct = np.unique(stored.astype(np.float32), axis=0)
+    distinct = np.unique(stored_entries(on_grid, options.centroids, name).astype(np.float32), axis=0)
     return distinct[np.argsort(np.einsum("kd,kd->k", distinct, distinct), kind="stable")]
 
 
@@ -342,6 +341,8 @@ def check_finite(cloud: GaussianCloud, frame: int) -> None:
     ------
     CloudError
         Something is not finite; the first array that is wrong is named.
+    CapabilityError
+        SH are too large for a palette.
     """
     for name in ("means", "quats", "sh0", "shN"):
         is_bad = ~np.isfinite(getattr(cloud, name))
@@ -355,6 +356,7 @@ def check_finite(cloud: GaussianCloud, frame: int) -> None:
         if is_bad.any():
             message = f"{int(is_bad.sum())} of {len(cloud)} splats hold NaN or a scale beyond float32; drop them first"
             raise CloudError(message, field=name, frame=frame)
+    check_range(cloud.shN, frame)
 
 
 BASE_RGB: Float32 = ((np.arange(SH0_ENTRIES) / 255 - 0.5) / SH_C0).astype(np.float32)

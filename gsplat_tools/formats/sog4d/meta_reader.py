@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,18 +19,24 @@ from gsplat_tools.formats.sog4d.rules import BAND_COEFFICIENTS, MAX_PALETTE, SH0
 from gsplat_tools.ops.visibility import tolerance_from_json
 
 
-def parse_meta(data: bytes) -> tuple[Meta | None, list[Issue]]:
-    """Return what meta.json says, or None where an error forbids it, and everything that is wrong with it."""
+def parse_meta(data: bytes, available: int = 0) -> tuple[Meta | None, list[Issue]]:
+    """Return what meta.json says, or None where an error forbids it, and everything that is wrong with it.
+
+    Parameters
+    ----------
+    data
+        The file.
+    available
+        Bytes of its archive, which bound the memory that it may take.
+    """
     issues: list[Issue] = []
     try:
-        data.decode("utf-8-sig")
+        root = _json.parse(data, available=available)
     except UnicodeDecodeError as error:
         issue = Issue(
             code="meta-encoding", message=f"expected UTF-8, found {error.reason}", field="meta.json", offset=error.start
         )
         return None, [issue]
-    try:
-        root = _json.parse(data)
     except ValueError as error:
         return None, [Issue(code="meta-json", message=f"expected a JSON object ({error})", field="meta.json")]
     if not isinstance(root, dict):
@@ -370,19 +377,23 @@ def _brief(value: Any) -> str:
 
 def _nulls(root: dict[str, Any]) -> list[Issue]:
     """Return an issue if any field is null."""
-    paths: list[str] = []
-    pending: list[tuple[str, Any]] = [("", root)]
-    while pending:
-        path, value = pending.pop()
-        if value is None:
-            paths.append(path)
-        elif isinstance(value, dict):
-            pending.extend((f"{path}.{name}" if path else name, part) for name, part in value.items())
-        elif isinstance(value, list):
-            pending.extend(
-                (f"{path}[{i}]", part) for i, part in enumerate(value) if part is None or isinstance(part, dict | list)
-            )
-    if not paths:
+    count, first = 0, ""
+    for path in _null_paths(root, ""):
+        first = path if count == 0 else min(first, path)
+        count += 1
+    if count == 0:
         return []
-    message = f"{len(paths)} values are null, which Unity does not read; leave the fields out"
-    return [Issue(code="json-null", message=message, field=f"meta.json {min(paths)}", count=len(paths))]
+    message = f"{count} values are null, which Unity does not read; leave the fields out"
+    return [Issue(code="json-null", message=message, field=f"meta.json {first}", count=count)]
+
+
+def _null_paths(node: Any, path: str) -> Iterator[str]:
+    """Yield where nulls are, one path at a time: there may be millions; `_json.parse` bounds the depth."""
+    is_list = isinstance(node, list)
+    for key, part in enumerate(node) if is_list else node.items():
+        if part is None or isinstance(part, dict | list):
+            place = f"{path}[{key}]" if is_list else f"{path}.{key}" if path else str(key)
+            if part is None:
+                yield place
+            else:
+                yield from _null_paths(part, place)

@@ -39,15 +39,8 @@ def repair(source: BinaryIO, target: BinaryIO) -> list[str]:
     archive = ZipReader(source, repeatable=REPEATABLE)
     if "meta.json" not in archive:
         raise CorruptDataError("there is no meta.json to repair", field="meta.json")
-    try:
-        root = _json.parse(archive.read("meta.json", at_most=_json.MAX_BYTES))
-    except ValueError as error:
-        raise CorruptDataError(f"expected a JSON object ({error})", field="meta.json") from error
-    if not isinstance(root, dict):
-        raise CorruptDataError(f"expected a JSON object, found {type(root).__name__}", field="meta.json")
-    changes = _respell(root)
-    data = json.dumps(root, separators=(",", ":")).encode()  # escaped: halves of surrogate pairs have no UTF-8
-    raise_errors(parse_meta(data)[1], RULES)
+    data, changes = _respelled(archive)
+    raise_errors(parse_meta(data, archive.length)[1], RULES)
     num_doubles = len(archive.issues)
     if num_doubles:
         changes.append(f"entries that occurred more than once kept as the last one ({num_doubles} remarks on the archive)")
@@ -58,6 +51,18 @@ def repair(source: BinaryIO, target: BinaryIO) -> list[str]:
             else:
                 writer.add(name, archive.read(name), "stored" if archive.method(name) == "stored" else "deflated")
     return changes
+
+
+def _respelled(archive: ZipReader) -> tuple[bytes, list[str]]:
+    """Return today's meta.json and what was changed; the values are gone once there is a text of them."""
+    try:
+        root = _json.parse(archive.description("meta.json"), available=archive.length)
+    except ValueError as error:
+        raise CorruptDataError(f"expected a JSON object ({error})", field="meta.json") from error
+    if not isinstance(root, dict):
+        raise CorruptDataError(f"expected a JSON object, found {type(root).__name__}", field="meta.json")
+    changes = _respell(root)
+    return json.dumps(root, separators=(",", ":")).encode(), changes  # escaped: halves of surrogate pairs have no UTF-8
 
 
 def _respell(root: dict[str, Any]) -> list[str]:

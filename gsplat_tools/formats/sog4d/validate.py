@@ -9,7 +9,6 @@ from typing import BinaryIO
 import numpy as np
 
 from gsplat_tools.errors import FormatError
-from gsplat_tools.formats import _json
 from gsplat_tools.formats._issues import Issue
 from gsplat_tools.formats._stream import stream_size
 from gsplat_tools.formats._zip import ZipReader
@@ -43,7 +42,7 @@ def check(stream: BinaryIO) -> Iterator[Issue]:
         yield Issue(code="meta-missing", message=message, field="meta.json")
         return
     try:
-        meta, issues = parse_meta(archive.read("meta.json", at_most=_json.MAX_BYTES))
+        meta, issues = parse_meta(archive.description("meta.json"), archive.length)
     except FormatError as error:
         yield _issue(error, "zip-entry-corrupt")
         return

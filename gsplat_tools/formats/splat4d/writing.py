@@ -12,6 +12,7 @@ from gsplat_tools.cloud import GaussianCloud
 from gsplat_tools.errors import CapabilityError, LossyConversionWarning
 from gsplat_tools.formats._label_delta import UPDATE, DeltaSegment, Labels, write_delta
 from gsplat_tools.formats._motion_repair import MotionRepair
+from gsplat_tools.formats._palettes import check_range, stored_entries
 from gsplat_tools.formats.base import Scene
 from gsplat_tools.formats.splat4d import container
 from gsplat_tools.formats.splat4d.container import BAND_COEFFICIENTS, DELTA, ENTRY, FULL, HEADER, META, TABLE_HEADER
@@ -20,7 +21,6 @@ from gsplat_tools.formats.splat4d.records import encode
 
 _ALIGNMENT = 16
 _DELTA_MAGIC = b"SPL4DLB1"
-_MAX_HALF = 65504.0
 
 
 def write(scene: Scene, stream: BinaryIO, options: Splat4dOptions) -> None:
@@ -144,16 +144,16 @@ def _fit_bands(cloud: GaussianCloud, options: Splat4dOptions) -> list[tuple[NDAr
     from gsplat_tools.codecs.palette import fit_palette, nearest_labels
     from gsplat_tools.ops.importance import importance
 
-    dtype = "<f2" if options.centroids == "f16" else "<f4"
+    check_range(cloud.shN)
     size = min(options.sh_palette_size or default_palette_size(len(cloud)), MAX_PALETTE)
     step = max(1, len(cloud) // max(1 << 15, 8 * size))
     bands: list[tuple[NDArray[np.floating], Labels]] = []
     first = 0
-    for count in BAND_COEFFICIENTS[: cloud.sh_degree]:
+    for band, count in enumerate(BAND_COEFFICIENTS[: cloud.sh_degree], start=1):
         points = np.ascontiguousarray(cloud.shN[:, first : first + count]).reshape(len(cloud), 3 * count)
         first += count
         fitted = fit_palette(points[::step], importance(cloud)[::step], size=size)
-        stored = (np.clip(fitted, -_MAX_HALF, _MAX_HALF) if dtype == "<f2" else fitted).astype(dtype)
+        stored = stored_entries(fitted, options.centroids, f"sh{band}")
         labels, _ = nearest_labels(points, stored.astype(np.float32))
         bands.append((stored, labels.astype(np.uint16)))
     return bands
