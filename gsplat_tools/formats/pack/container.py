@@ -142,13 +142,13 @@ def parse(stream: BinaryIO, layouts_of: Callable[[Mapping[str, Any]], Sequence[S
         raise CorruptDataError(
             f"{json_length} bytes at {json_offset} are not in a file of {size}", field="json_offset", offset=16
         )
-    if json_length > _json.longest(size):
-        raise LimitExceededError(f"{json_length} bytes are more than {_json.longest(size)}", field="json_length", offset=24)
+    if json_length > _json.longest(0):
+        raise LimitExceededError(f"{json_length} bytes are more than {_json.longest(0)}", field="json_length", offset=24)
     stream.seek(json_offset)
     text = read_exactly(stream, json_length, field="description")
     if zlib.crc32(text) != checksum:
         raise CorruptDataError("the checksum of the description differs", field="json_crc32", offset=32)
-    description = _parse_json(text, json_offset, size)
+    description = _parse_json(text, json_offset)
     if layout >= len(LAYOUTS) or description.get("layout") != LAYOUTS[layout]:
         raise CorruptDataError(
             f"the header says layout {layout}, the description {_json.shown(description.get('layout'))}",
@@ -162,14 +162,14 @@ def parse(stream: BinaryIO, layouts_of: Callable[[Mapping[str, Any]], Sequence[S
     return Container(description, count, frame_rows, streams, size)
 
 
-def _parse_json(text: bytes, offset: int, available: int) -> dict[str, Any]:
+def _parse_json(text: bytes, offset: int) -> dict[str, Any]:
     """Return the object that a description is."""
 
     def refuse(name: str) -> float:
         raise CorruptDataError(f"{name} is not a JSON number", field="description", offset=offset)
 
     try:
-        description = _json.parse(text, available=available, parse_constant=refuse)
+        description = _json.parse(text, parse_constant=refuse)
     except CorruptDataError:
         raise
     except ValueError as error:
