@@ -68,10 +68,11 @@ def estimate(
             if options.get("clip") == "rendered":
                 options["clip"] = rendered_clip(valid, options)
             try:
+                views = 0 if validation is None else validation.views
                 found = predict(
                     valid,
                     Setting(format=record.id, preset=preset, options=options),
-                    views=0 if validation is None else validation.views,
+                    views=views,
                     size=VALIDATION_SIZE if validation is None else validation.size,
                 )
             except GsplatError as error:
@@ -81,5 +82,6 @@ def estimate(
         "source": ", ".join(map(str, sources)),
         "source_format": source_format,
         "target": {"path": str(target), "format": record.id},
+        "views": views,
         **found.to_json(),
     }

@@ -150,12 +150,12 @@ def _draw(pairs: list[Pair], target: Format, how: Validation) -> dict[str, Any]:
     from gsplat_tools.reference.auto_cameras import auto_cameras
 
     if not pairs or how.views == 0:
-        return {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None}
+        return {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None, "views": 0}
     model = (how.model, None) if how.model is not None else target.model
     cameras = auto_cameras(pairs[0][1], views=how.views, size=how.size)
     report = compare_rendered(pairs, cameras, model, num_pairs=len(pairs))
     names = ("psnr_min", "psnr_mean", "ssim_mean", "max_abs", "identical", "worst_view", "model", "rendered_splats")
-    return {name: getattr(report, name) for name in names}
+    return {**{name: getattr(report, name) for name in names}, "views": how.views}
 
 
 def _still_sequence(scene: GaussianCloud | CloudChunks) -> GaussianSequence:

@@ -362,7 +362,11 @@ def _arguments(given: dict[str, Any], records: list[Format]) -> list[dict[str, A
 
 def _estimated(report: dict[str, Any]) -> str:
     """Return an estimate in words."""
-    level = "identical pictures" if report["psnr_min"] is None else f"PSNR min {report['psnr_min']:.1f} dB"
+    level = (
+        "identical pictures"
+        if report["psnr_min"] is None
+        else f"PSNR min {report['psnr_min']:.1f} dB of {report['views']} views"
+    )
     if report["exact"]:
         basis = "measured on the whole scene"
     else:
@@ -405,7 +409,7 @@ def _summary(report: dict[str, Any]) -> str:
         lines += [line if line.startswith("  ") else f"  {line}" for line in errors.splitlines()]
     if validation["psnr_min"] is not None:
         lines.append(
-            f"  rendered ({validation['model']}): PSNR min {validation['psnr_min']:.2f} dB, "
+            f"  rendered ({validation['model']}, {validation['views']} views): PSNR min {validation['psnr_min']:.2f} dB, "
             f"mean {validation['psnr_mean']:.2f} dB, SSIM {output.number(validation['ssim_mean'], 5)}, "
             f"largest difference {validation['max_abs']:.4f}"
         )

@@ -179,6 +179,7 @@ class Workbench:
             given[:] = [prepared]
 
         encode, decode = list[float](), list[float]()
+        peak: int | None = None
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             path = Path(folder) / f"candidate{record.extensions[0]}"
@@ -188,7 +189,8 @@ class Workbench:
                     self.scene, path, to=record.id, overwrite=True, preset=setting.preset, check=remember, **setting.options
                 )
                 highest = _status("VmHWM")
-                peak = None if resident is None or highest is None else max(0, highest - resident)
+                if resident is not None and highest is not None:
+                    peak = max(peak or 0, highest - resident)
                 encode.append(report.seconds["read"] + report.seconds["encode"])
             for _ in range(repeats):
                 start = time.perf_counter()

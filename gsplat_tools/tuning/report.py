@@ -65,7 +65,7 @@ _COLUMNS = (
     ("format", "", None), ("settings", "", None), ("bytes", "{:,}", "bytes"), ("bytes a splat", "{:.2f}", "bytes_per_splat"),
     ("PSNR min dB", "{:.2f}", "psnr_min"), ("PSNR mean dB", "{:.2f}", "psnr_mean"), ("SSIM", "{:.5f}", "ssim_mean"),
     ("largest error", "{:.4f}", "max_abs"), ("encode s", "{:.3f}", "encode_seconds"), ("decode s", "{:.3f}", "decode_seconds"),
-    ("peak MB", "{:.0f}", "peak_memory"),
+    ("peak MB", "{:.1f}", "peak_memory"),
 )  # fmt: skip
 
 
@@ -133,6 +133,8 @@ def html_report(tradeoff: Tradeoff, title: str, machine: str) -> str:
         f'<p class="legend">{legend}</p><div class="plots">{plots}</div>',
         "<h2>All points</h2><p class='note'>A click on a heading sorts.</p>",
         _table(rows),
+        "<h2>Errors of attributes</h2><p class='note'>Root mean square and largest, in the units of the attribute.</p>",
+        _attributes(rows),
     ]
     if tradeoff.skipped:
         reasons = "".join(f"<li>{escape(s.label)}: {escape(reason)}</li>" for s, reason in tradeoff.skipped)
@@ -186,6 +188,23 @@ def _table(rows: list[dict[str, Any]]) -> str:
             else:
                 cells.append(f'<td data-v="{value}">{form.format(value)}</td>')
         lines.append(f"<tr{' class=pareto' if row['pareto'] else ''}>{''.join(cells)}</tr>")
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _attributes(rows: list[dict[str, Any]]) -> str:
+    """Return the errors of every attribute of every point."""
+    names = list(dict.fromkeys(name for row in rows for name in row["attributes"]))
+    head = "".join(f'<th scope="col"><button>{name}</button></th>' for name in ("format", "settings", *names))
+    lines = []
+    for row in rows:
+        cells = [f"<td>{escape(row['format'])}</td><td>{escape(_words(row))}</td>"]
+        for name in names:
+            errors = row["attributes"].get(name)
+            if errors is None or errors["rms"] is None or errors["max"] is None:
+                cells.append('<td data-v="-1">-</td>')
+            else:
+                cells.append(f'<td data-v="{errors["rms"]}">{errors["rms"]:.2g} / {errors["max"]:.2g}</td>')
+        lines.append(f"<tr>{''.join(cells)}</tr>")
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
 
 

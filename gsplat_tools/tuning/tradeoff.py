@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -169,14 +170,13 @@ def measure_tradeoff(
         sh_degree=scene.sh_degree,
         cropped_from=whole,
     )
-    warm = set[str]()
     with stage("measuring", len(wanted), "settings") as progress:
         for setting in wanted:
             seen: list[tuple[Picture, Picture]] = []
             try:
-                if setting.format not in warm and not is_sequence:
-                    small.measure(setting, draw=False)
-                    warm.add(setting.format)
+                if not is_sequence:
+                    with suppress(GsplatError):  # a few splats may not do where the scene does
+                        small.measure(setting, draw=False)
                 point = bench.measure(setting, repeats=repeats, see=_keep_in(seen))
             except GsplatError as error:
                 error.path = None  # a temporary file, of which the name says nothing

@@ -109,7 +109,7 @@ def test_report__is_one_page_that_fetches_nothing_and_shows_every_point(tmp_path
     assert [point["identical"] for point in points if point["format"] == "ply"] == [True]
     parsed = Page()
     parsed.feed(page.read_text(encoding="utf-8"))
-    assert parsed.rows == len(points) + 1
+    assert parsed.rows == 2 * (len(points) + 1)  # points, and the errors of their attributes
     assert all(address.startswith("data:image/webp;base64,") for address in parsed.addresses)
     rows = list(csv.DictReader(io.StringIO(table.read_text(encoding="utf-8"))))
     assert [int(row["bytes"]) for row in rows] == [point["bytes"] for point in points]
