@@ -22,6 +22,8 @@ Result = TypeVar("Result")
 EXIT_DATA = 1
 EXIT_INTERRUPTED = 130
 
+_AGAIN_SECONDS = 0.05
+
 
 def one_line(text: object) -> str:
     """Return a text without line breaks and control characters."""
@@ -31,15 +33,42 @@ def one_line(text: object) -> str:
 class _EndedError(SystemExit):
     """A signal ends the command."""
 
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.number = number
+
 
 def _end_cleanly_on_signals() -> None:
     """Let SIGTERM and SIGHUP unwind the stack, so that temporary files are removed."""
+    said = set[int]()
 
     def end(number: int, _frame: object) -> None:
-        click.echo(f"ended by {signal.Signals(number).name}; the target is as it was", err=True)
-        raise _EndedError(128 + number)
+        if number not in said:
+            click.echo(f"ended by {signal.Signals(number).name}; the target is as it was", err=True)
+        said.add(number)
+        raise _EndedError(number)
 
     _listen(end)
+
+
+@contextmanager
+def _ending_after_finalizers() -> Iterator[None]:
+    """Send a signal again that came while a finalizer ran: what it raises there is forgotten, and in a hook as well."""
+    report = sys.unraisablehook
+
+    def end_again(unraisable: Any) -> None:
+        if isinstance(unraisable.exc_value, _EndedError):
+            again = threading.Timer(_AGAIN_SECONDS, os.kill, (os.getpid(), unraisable.exc_value.number))
+            again.daemon = True
+            again.start()
+        else:
+            report(unraisable)
+
+    sys.unraisablehook = end_again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
 
 
 def _listen(handler: Any) -> None:
@@ -101,7 +130,7 @@ def reports_errors(command: Callable[Parameters, Result]) -> Callable[Parameters
     def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         _end_cleanly_on_signals()
         try:
-            with _showing_warnings():
+            with _showing_warnings(), _ending_after_finalizers():
                 return command(*args, **kwargs)
         except GsplatError as error:
             click.echo(f"error: {one_line(error)}", err=True)

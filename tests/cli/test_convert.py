@@ -291,6 +291,27 @@ reports_errors(lambda: os.kill(os.getpid(), signal.SIGTERM))()
     assert ended.stderr == "ended by SIGTERM; the target is as it was\n"
 
 
+def test_a_signal_while_a_finalizer_runs__is_not_forgotten() -> None:
+    text = """
+import os, signal, time
+from gsplat_tools.cli._errors import reports_errors
+
+class Finalized:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+def command():
+    Finalized()
+    time.sleep(30)
+
+reports_errors(command)()
+"""
+    ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
+
+    assert ended.returncode == 128 + signal.SIGTERM
+    assert ended.stderr == "ended by SIGTERM; the target is as it was\n"
+
+
 def test_dry_run__estimates_and_writes_nothing(tmp_path: Path) -> None:
     source = tmp_path / "scene.ply"
     save(random_cloud(200, sh_degree=1), source)
