@@ -11,9 +11,9 @@ import numpy as np
 
 from gsplat_tools.formats._limits import max_memory
 
-ALWAYS_READ = 48 << 20
+ALWAYS_READ = 40 << 20
 """Memory that a description may take whatever holds it: its bytes, its text and its values, all at once. With what else a
-reader needs that stays within 64 MiB; a sequence of 20,000 frames and a tree of 6,000 leaves in 5 levels take less."""
+reader needs that stays within 64 MiB; a sequence of 16,000 frames and a tree of 5,000 leaves in 5 levels take less."""
 
 _MEMORY_A_BYTE = 2  # of a file whose frames are many: each takes several entries, far larger than what describes it
 
