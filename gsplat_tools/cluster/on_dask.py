@@ -281,6 +281,9 @@ class Dask:
     def close(self) -> None:
         """Leave a running cluster, or end our own."""
         if self._client is not None:
+            for topic in ("all", _FAILED_TOPIC):  # or the scheduler tells of our leaving, to whom has left
+                with suppress(Exception):
+                    self._client.unsubscribe_topic(topic)
             with suppress(Exception):
                 self._client.close(timeout=5)
         if self._cluster is not None:

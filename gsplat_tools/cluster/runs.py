@@ -154,12 +154,12 @@ def judge(
     """
     if validation is None:
         return None
-    result: dict[str, Any] = {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None}
+    result: dict[str, Any] = {"psnr_min": None, "psnr_mean": None, "ssim_mean": None, "max_abs": None, "views": 0}
     if views:
         name, variant = model if validation.model is None else (validation.model, None)
         report = summarize_views(views, name if variant is None else f"{name} {variant}", 0)
         result = {each: getattr(report, each) for each in ("psnr_min", "psnr_mean", "ssim_mean", "max_abs", "identical")}
-        result |= {"worst_view": report.worst_view, "model": report.model}
+        result |= {"worst_view": report.worst_view, "model": report.model, "views": validation.views}
     level = result["psnr_min"]
     if validation.min_psnr is not None and level is not None and level < validation.min_psnr:
         raise ValidationError(
