@@ -115,6 +115,10 @@ class CloudError(GsplatError, ValueError):
     """The arrays break an invariant of GaussianCloud."""
 
 
+TARGET_EXISTS = "the target exists; use --overwrite (library: overwrite=True) to replace it"
+"""What `TargetExistsError` says wherever a target is refused before anything is written."""
+
+
 class TargetExistsError(GsplatError, FileExistsError):
     """The target is there and overwriting was not asked for."""
 

@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 from gsplat_tools.cli import _output as output
 from gsplat_tools.cli._errors import EXIT_DATA, EXIT_INTERRUPTED, one_line
-from gsplat_tools.errors import CapabilityError, FormatError, GsplatError, TargetExistsError
+from gsplat_tools.errors import TARGET_EXISTS, CapabilityError, FormatError, GsplatError, TargetExistsError
 from gsplat_tools.formats._stores import is_url, local_path
 from gsplat_tools.formats.base import Format
 from gsplat_tools.formats.saving import find_target
@@ -188,8 +188,7 @@ def _convert_whole(item: Item, engine: Engine) -> dict[str, Any]:
     check_alike(engine)
     located = item.located()
     if not item.arguments["overwrite"] and standing_at(located) is not None:
-        message = "the target exists; use --overwrite (library: overwrite=True) to replace it"
-        raise TargetExistsError(message, path=item.target)
+        raise TargetExistsError(TARGET_EXISTS, path=item.target)
     outcome = next(engine.results([engine.submit(convert_once, located, max_memory())]))
     cluster = {"scheduler": engine.name, "workers": engine.workers, "dashboard": engine.dashboard}
     return {**item.named(outcome.result()), "cluster": cluster}

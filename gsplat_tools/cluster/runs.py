@@ -21,7 +21,7 @@ from gsplat_tools.cluster.outcomes import Outcome
 from gsplat_tools.comparison.attributes import AttributeTally
 from gsplat_tools.comparison.rendered import ViewReport, summarize_views
 from gsplat_tools.convert import ConversionReport
-from gsplat_tools.errors import CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError
+from gsplat_tools.errors import TARGET_EXISTS, CapabilityError, ClusterError, GsplatWarning, TargetExistsError, ValidationError
 from gsplat_tools.formats._atomic import check_target
 from gsplat_tools.formats._stores import exists, is_url, local_path
 from gsplat_tools.formats.saving import find_target
@@ -94,7 +94,7 @@ def bundle_target(target: str | Path, to: str | None, what: str, *, overwrite: b
     if not is_url(target):
         check_target(target, overwrite=overwrite)
     elif exists(target) and not overwrite:
-        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=target)
+        raise TargetExistsError(TARGET_EXISTS, path=target)
     return target
 
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from gsplat_tools.errors import GsplatError, TargetExistsError, WriteError
+from gsplat_tools.errors import TARGET_EXISTS, GsplatError, TargetExistsError, WriteError
 from gsplat_tools.formats._companion import file_of, published, remove_beside, sweep_beside
 from gsplat_tools.formats._files import RecordedFile, reason
 
@@ -231,7 +231,7 @@ def check_target(path: Path, *, overwrite: bool) -> Path:
         if not target.is_file():
             raise WriteError("the target is not a regular file (a device or a pipe); write to a file", path=path)
         if not overwrite:
-            raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=path)
+            raise TargetExistsError(TARGET_EXISTS, path=path)
         if not os.access(target, os.W_OK):
             raise WriteError("the target is write-protected; change its permissions or write elsewhere", path=path)
     if not target.parent.is_dir():

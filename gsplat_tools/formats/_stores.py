@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from gsplat_tools.errors import GsplatError, ReadError, TargetExistsError, WriteError
+from gsplat_tools.errors import TARGET_EXISTS, GsplatError, ReadError, TargetExistsError, WriteError
 from gsplat_tools.formats._store_requests import ask, fetch, file_system, in_words
 
 BLOCK_BYTES = 8 << 20
@@ -285,7 +285,7 @@ def replacing_object(path: str | Path, *, overwrite: bool, block_bytes: int = BL
         The store refuses to take it.
     """
     if not overwrite and exists(path):
-        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=url_of(path))
+        raise TargetExistsError(TARGET_EXISTS, path=url_of(path))
     writer = ObjectWriter(path, block_bytes=block_bytes)
     try:
         yield writer

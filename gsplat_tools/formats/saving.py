@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsplat_tools.chunks import CloudChunks
-from gsplat_tools.errors import CapabilityError, FormatError, GsplatWarning, TargetExistsError, WriteError
+from gsplat_tools.errors import TARGET_EXISTS, CapabilityError, FormatError, GsplatWarning, TargetExistsError, WriteError
 from gsplat_tools.formats._atomic import read_back, replacing, temporary_beside
 from gsplat_tools.formats._companion import path_of, write_beside
 from gsplat_tools.formats._folder import folder_size, replacing_folder
@@ -101,7 +101,7 @@ def _replacing_object(path: Path, record: Format, *, overwrite: bool) -> Iterato
     if record.claims is not None or (record.folder is not None and path.name == record.folder.index):
         raise CapabilityError(f"{record.title} is more than one file; write it to a disk and copy them", path=path)
     if not overwrite and exists(path):
-        raise TargetExistsError("the target exists; use --overwrite (library: overwrite=True) to replace it", path=path)
+        raise TargetExistsError(TARGET_EXISTS, path=path)
     with tempfile.TemporaryDirectory(prefix="gsplat-") as folder, temporary_beside(Path(folder) / path.name) as stream:
         yield stream
         read_back(stream, path)

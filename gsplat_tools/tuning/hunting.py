@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -216,9 +216,8 @@ class Hunt:
         if by_psnr and best is not None:
             most = min(most, best.bytes * (1 if self._is_large else _WORTH_COARSENING))
         chosen: tuple[dict[str, Any], Trial, str] | None = None
-        for name, changes in self._whole.record.presets.items():
-            options = {option: value for option, value in changes.items() if option not in self._whole.fixed}
-            trial = None if name == _EXACT else self._try(options, most)
+        for name, options in self._preset_options():
+            trial = self._try(options, most)
             if trial is None:
                 continue
             if trial.bytes <= most and self._holds(trial) and (chosen is None or self._is_better(trial, chosen[1])):
@@ -231,9 +230,14 @@ class Hunt:
 
     def _presets(self) -> list[Trial]:
         """Encode and draw all presets that the format can hold the scene with."""
-        changes = (each for name, each in self._whole.record.presets.items() if name != _EXACT)
-        tried = (self._try({k: v for k, v in each.items() if k not in self._whole.fixed}, np.inf) for each in changes)
+        tried = (self._try(options, np.inf) for _, options in self._preset_options())
         return [trial for trial in tried if trial is not None]
+
+    def _preset_options(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield the presets that a search may take, without what was given."""
+        for name, changes in self._whole.record.presets.items():
+            if name != _EXACT:
+                yield name, {option: value for option, value in changes.items() if option not in self._whole.fixed}
 
     def _try(self, options: dict[str, Any], limit: float) -> Trial | None:
         """Encode the whole scene, and draw it if it is no larger than a limit; None where the format cannot hold it."""
